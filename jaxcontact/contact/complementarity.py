@@ -1,0 +1,130 @@
+"""The linear complementarity problem of one step, condensed to the contact pairs.
+
+    0 <= p  _|_  g = W p + q >= 0,
+
+with the contact compliance W = N D^-1 N^T (SPD), the multiplier p and the relative velocity g at
+which a pair separates; -q is the velocity by which the free motion would violate the constraint.
+Source: MATH.md 2.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+from jax import Array
+
+#: A step counts as solved if its KKT residual is below this multiple of the largest violation
+#: of the free motion, or below the rounding errors of the gap.
+RELATIVE_TOLERANCE = {"float64": 1e-11, "float32": 1e-5}
+
+
+class Status(IntEnum):
+    """How the contact problem of a step ended."""
+
+    CONVERGED = 0
+    FALLBACK = 1
+    """Converged, but by the safeguard (projected Gauss-Seidel) instead of the chosen method."""
+    NOT_CONVERGED = 2
+    NON_FINITE = 3
+
+
+class Solution(NamedTuple):
+    """The solution of the complementarity problem of C contact pairs."""
+
+    multiplier: Array
+    """p >= 0, (C,) [impulse]."""
+
+    active: Array
+    """g = 0 up to rounding, (C,) bool: strong and weak contact together."""
+
+    iterations: Array
+    """Number of active sets (Newton) or sweeps (Gauss-Seidel), int32."""
+
+    status: Array
+    """A `Status`, int32."""
+
+    residual: Array
+    """KKT residual relative to the largest violation of the free motion, scalar."""
+
+
+class ContactSolver(Protocol):
+    """An option object: static, hashable, without arrays."""
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+        """Solve the complementarity problem.
+
+        Args:
+            compliance: W, (C, C) SPD.
+            offset: q, (C,).
+            resolution: rounding error of q, (C,); smaller values are zero.
+            guess: active set to start from, (C,) bool.
+        """
+        ...
+
+    def softness(self, solution_multiplier: Array, separation: Array) -> Array | None:
+        """Return dg/dp of the contact law, (C,), or None if contact is exact (rigid)."""
+        ...
+
+
+def separation(compliance: Array, offset: Array, multiplier: Array) -> Array:
+    """Return g = W p + q, (C,)."""
+    return compliance @ multiplier + offset
+
+
+def residual(compliance: Array, offset: Array, multiplier: Array) -> Array:
+    """Return the natural residual |min(W_ii p_i, g_i)|, (C,), in units of velocity."""
+    g = separation(compliance, offset, multiplier)
+    return jnp.abs(jnp.minimum(jnp.diagonal(compliance) * multiplier, g))
+
+
+def tolerance(offset: Array, resolution: Array) -> Array:
+    """Return the residual (C,) below which a step counts as solved."""
+    violation = jnp.max(jnp.maximum(-offset, 0.0))
+    return RELATIVE_TOLERANCE[str(offset.dtype)] * violation + 4.0 * resolution
+
+
+def solve_on_set(compliance: Array, active: Array, softness: Array | None, rhs: Array) -> Array:
+    """Return p with (W p + softness p)_i = rhs_i on the active set and p_i = rhs_i elsewhere.
+
+    Args:
+        compliance: W, (C, C) SPD.
+        active: the active set, (C,) bool.
+        softness: added to the diagonal on the active set, (C,), or None for zero.
+        rhs: right-hand side, (C,).
+    """
+    inside = active[:, None] & active[None, :]
+    diagonal = jnp.where(active, 0.0 if softness is None else softness, 1.0)
+    # Scaling by the diagonal keeps pairs of very different stiffness apart.
+    scale = jax.lax.rsqrt(jnp.where(active, jnp.diagonal(compliance), 0.0) + diagonal)
+    matrix = jnp.where(inside, compliance, 0.0) * scale[:, None] * scale[None, :]
+    matrix = matrix + jnp.diag(diagonal.astype(compliance.dtype) * scale**2)
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    return scale * jax.scipy.linalg.cho_solve(factor, scale * rhs)
+
+
+def finish(
+    compliance: Array,
+    offset: Array,
+    resolution: Array,
+    multiplier: Array,
+    iterations: Array,
+    is_fallback: Array,
+) -> Solution:
+    """Return the solution with its active set and a status that is earned by the residual."""
+    g = separation(compliance, offset, multiplier)
+    error = residual(compliance, offset, multiplier)
+    goal = tolerance(offset, resolution)
+    is_solved = jnp.all(error <= goal)
+    is_finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(offset))
+    status = jnp.where(is_fallback, Status.FALLBACK, Status.CONVERGED)
+    status = jnp.where(is_solved, status, Status.NOT_CONVERGED)
+    status = jnp.where(is_finite, status, Status.NON_FINITE)
+    active = (multiplier > 0.0) | (g <= goal)
+    relative_tolerance = RELATIVE_TOLERANCE[str(offset.dtype)]
+    tiny = jnp.finfo(offset.dtype).tiny
+    relative = relative_tolerance * jnp.max(error / jnp.maximum(goal, tiny))
+    return Solution(multiplier, active, iterations, status.astype(jnp.int32), relative)

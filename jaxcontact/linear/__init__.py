@@ -1,0 +1,10 @@
+"""Factor-once linear solvers with the contact condensed to the contact pairs.
+
+A solver is an option object with one method, `factorize`; the factor answers what a step asks
+of the matrix D: solve with it, and solve a contact problem on it in one sweep (MATH.md 2).
+"""
+
+from jaxcontact.linear.dense import Dense
+from jaxcontact.linear.interface import Factor, LinearSolver
+
+__all__ = ["Dense", "Factor", "LinearSolver"]

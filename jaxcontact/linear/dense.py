@@ -1,0 +1,74 @@
+"""The dense inverse: the fastest solver for a few hundred unknowns and for reduced models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+from jax import Array
+
+from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DenseFactor:
+    """The explicit inverse of D with its contact columns."""
+
+    inverse: Array
+    """D^-1, (n, n)."""
+
+    contact_response: Array
+    """N D^-1, (C, n)."""
+
+    compliance: Array
+    """N D^-1 N^T, (C, C)."""
+
+    def solve(self, rhs: Array) -> Array:
+        """Return D^-1 rhs, (n,)."""
+        return self.inverse @ rhs
+
+    def condense(self, rhs: Array) -> tuple[Array, Array]:
+        """Return D^-1 rhs, (n,), and N D^-1 rhs, (C,)."""
+        return self.inverse @ rhs, self.contact_response @ rhs
+
+    def expand(self, partial: Array, multiplier: Array) -> Array:
+        """Return D^-1 (rhs - N^T multiplier), (n,)."""
+        return partial - multiplier @ self.contact_response
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Invert the matrix once; a solve is one matrix-vector product.
+
+    Memory and time of a solve grow with n^2: use it up to about n = 1000.
+    """
+
+    def factorize(
+        self,
+        matrix: SymmetricMatrix,
+        normals: ContactNormals,
+        coordinates: np.ndarray | None = None,
+    ) -> DenseFactor:
+        """Return the inverse; NaN everywhere if the matrix is not positive definite.
+
+        Args:
+            matrix: D, SPD, (n, n).
+            normals: N, (C, n).
+            coordinates: not used.
+        """
+        n = matrix.size
+        rows = jnp.broadcast_to(jnp.arange(n, dtype=jnp.int32)[None, :], matrix.columns.shape)
+        dense = jnp.zeros((n, n), matrix.values.dtype).at[rows, matrix.columns].add(matrix.values)
+        # Jacobi scaling first: it makes the inverse of a badly scaled matrix accurate.
+        scale = 1.0 / jnp.sqrt(jnp.diagonal(dense))
+        identity = jnp.eye(n, dtype=dense.dtype)
+        factor = jax.scipy.linalg.cho_factor(scale[:, None] * dense * scale[None, :], lower=True)
+        inverse = jax.scipy.linalg.cho_solve(factor, identity)
+        inverse = scale[:, None] * (0.5 * (inverse + inverse.T)) * scale[None, :]
+        response = jnp.sum(normals.weights[:, :, None] * inverse[normals.unknowns], axis=1)
+        compliance = jnp.sum(normals.weights[None] * response[:, normals.unknowns], axis=2)
+        return DenseFactor(inverse, response, 0.5 * (compliance + compliance.T))

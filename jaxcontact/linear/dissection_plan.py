@@ -1,0 +1,221 @@
+"""Symbolic factorisation for nested dissection (host, NumPy): fronts, batches and index maps.
+
+Depths of the separator tree are merged into stages; the nodes that one part eliminates at one stage
+are a *front* with s own unknowns and b boundary unknowns (later unknowns coupled to it). A solve
+streams s (s + 2 b) numbers per front. Fronts of a stage are padded to one size and become one batched
+product, or a few where sizes differ. Stages and batches minimise
+
+    numbers streamed + LAUNCH_COST * number of batches.
+
+Source: J. Liu, The multifrontal method for sparse matrix solution, SIAM Review 34 (1992).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxcontact.linear.dissection_layout import BatchPlan, Unknowns, lay_out, make_stage, places
+from jaxcontact.linear.dissection_order import dissect, hop_coordinates
+
+LAUNCH_COST = 20_000
+"""Time of the kernels of one batch, in numbers streamed in that time (about 3 us on a CPU)."""
+
+
+class DissectionPlan(NamedTuple):
+    """Everything about a factorisation that the sparsity pattern decides."""
+
+    stages: tuple[tuple[BatchPlan, ...], ...]
+    """Batches of each stage; the first stage are the leaves, the last is the root (one front)."""
+    places: np.ndarray
+    """Place of each unknown in the solution of all stages, root first, (n,) int32."""
+    contact_places: np.ndarray
+    """Position of each contact unknown in the root front, (C, k) int32."""
+    n_factor_entries: int
+    """Entries of the factor's lower triangle without any padding."""
+    n_stored: int
+    """Numbers stored by the factor, padding and contact included."""
+
+
+def estimate_memory(plan: DissectionPlan, itemsize: int) -> int:
+    """Return the bytes of a factor with numbers of `itemsize` bytes, index maps included."""
+    maps = sum(
+        batch.own.nbytes + batch.boundary.nbytes + batch.sources.nbytes
+        for stage in plan.stages
+        for batch in stage
+    )
+    return plan.n_stored * itemsize + maps + plan.places.nbytes
+
+
+class _Tree(NamedTuple):
+    """Separator tree of the nodes: where each is eliminated, and the boundary of every part."""
+
+    depth: np.ndarray
+    part: np.ndarray
+    rank: np.ndarray  # place in the order of elimination
+    boundary: list[tuple[np.ndarray, np.ndarray]]  # per depth: part and node, sorted by part, rank
+    own_size: list[np.ndarray]  # per depth and part: unknowns
+    boundary_size: list[np.ndarray]
+
+
+def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
+    """Order the unknowns and lay out the factorisation.
+
+    Args:
+        columns: (width, n) columns of the matrix, padded by the own row.
+        unknowns: (C, k) contact unknowns, eliminated last.
+        coordinates: (n, d) positions of the unknowns, or None.
+        leaf_size: largest number of unknowns in a leaf of the separator tree.
+    """
+    n = columns.shape[1]
+    is_contact = np.zeros(n, bool)
+    is_contact[unknowns] = True
+    node, first = _group(columns, is_contact)
+    sizes = np.bincount(node)
+    tails = np.broadcast_to(np.arange(len(first)), (len(columns), len(first))).ravel()
+    pairs = np.unique(tails * len(first) + node[columns[:, first]].ravel())
+    edges = np.stack([pairs // len(first), pairs % len(first)], 1)
+    half = edges[edges[:, 0] < edges[:, 1]]
+    if coordinates is None:
+        points = hop_coordinates(half, len(first))
+    else:
+        points = coordinates[first]
+    tree = _eliminate(dissect(half, points, sizes, is_contact[first], leaf_size), edges, sizes)
+    heads = _merge_depths(tree)
+    where = _locate(tree, heads, node)
+    stages = []
+    for head, end in zip(heads, [*heads[1:], len(tree.own_size)], strict=True):
+        own = _own_size(tree, head, end)
+        parts, nodes = tree.boundary[head]
+        keys, members = _unknowns_of(parts, nodes, node, sizes, where.rank)
+        offset = stages[-1].n_solution if stages else 0
+        batch = _batch(own, tree.boundary_size[head])[0]
+        stages.append(make_stage(own, tree.boundary_size[head], batch, keys, members, offset))
+    root_places = where.local[unknowns].astype(np.int32)
+    n_stored = sum(int((x.s * (x.s + x.b)).sum()) for x in stages)
+    n_contact = len(unknowns)
+    return DissectionPlan(
+        stages=lay_out(stages, where, columns),
+        places=places(stages, where).astype(np.int32),
+        contact_places=root_places,
+        n_factor_entries=_count_entries(tree),
+        n_stored=n_stored + n_contact * (int(stages[0].s[0]) + n_contact),
+    )
+
+
+def _group(columns, is_contact):
+    """Group unknowns with identical rows into nodes: node (n,) and a first unknown of each (N,)."""
+    n = columns.shape[1]
+    key = np.random.default_rng(0).integers(0, 2**63, n, dtype=np.uint64)
+    is_own = columns == np.arange(n)
+    signature = np.where(is_own, 0, key[columns]).sum(0, dtype=np.uint64) + key * is_own.any(0)
+    signature = np.where(is_contact, ~signature, signature)
+    _, first, node = np.unique(signature, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # number the nodes as the unknowns are numbered
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return rank[node], first[order]
+
+
+def _eliminate(dissection, edges, sizes) -> _Tree:
+    """Find the boundary of each part: the later nodes that its elimination couples."""
+    depth, part, n_depths = dissection
+    n = len(depth)
+    rank = np.empty(n, np.int64)  # nodes near the leaves first, so children and parents agree
+    rank[np.lexsort((part, -depth))] = np.arange(n)
+    node_of_rank = np.argsort(rank)
+    below, above = edges[depth[edges[:, 0]] > depth[edges[:, 1]]].T
+    boundary, own_size, boundary_size = [], [], []
+    inherited = np.zeros(0, np.int64)
+    for level in range(n_depths - 1, -1, -1):
+        is_here = depth[below] == level
+        direct = part[below[is_here]] * n + rank[above[is_here]]
+        pairs = np.unique(np.concatenate([direct, inherited]))
+        parts, nodes = pairs // n, node_of_rank[pairs % n]
+        n_parts = 2 ** max(level - 1, 0)
+        here = np.flatnonzero(depth == level)
+        boundary.append((parts, nodes))
+        own_size.append(np.bincount(part[here], sizes[here], n_parts).astype(np.int64))
+        boundary_size.append(np.bincount(parts, sizes[nodes], n_parts).astype(np.int64))
+        is_later = depth[nodes] < level - 1
+        inherited = (parts[is_later] // 2) * n + rank[nodes[is_later]]
+    return _Tree(depth, part, rank, boundary[::-1], own_size[::-1], boundary_size[::-1])
+
+
+def _merge_depths(tree) -> list[int]:
+    """Choose the stages: the first depth of each, from the root, by dynamic programming."""
+    n_depths = len(tree.own_size)
+    best, choice = [0.0] * (n_depths + 1), [0] * (n_depths + 1)
+    for head in range(n_depths - 1, -1, -1):
+        own, costs = np.zeros_like(tree.own_size[head]), []
+        for end in range(head + 1, n_depths + 1):
+            own = own + tree.own_size[end - 1].reshape(len(own), -1).sum(1)
+            stage_cost = _batch(own, tree.boundary_size[head])[1]
+            costs.append(stage_cost + best[end])
+            if stage_cost > 4 * min(costs):
+                break
+        best[head] = min(costs)
+        choice[head] = head + 1 + int(np.argmin(costs))
+    heads = [0]
+    while choice[heads[-1]] < n_depths:
+        heads.append(choice[heads[-1]])
+    return heads
+
+
+def _batch(own, boundary, n_cuts=12):
+    """Split fronts into batches of similar size: batch of each front (F,), and the cost."""
+    order = np.argsort(own * (own + 2 * boundary), kind="stable")
+    cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
+    s = np.maximum.reduceat(own[order], cuts[:-1])
+    b = np.maximum.reduceat(boundary[order], cuts[:-1])
+    best, start = [0.0], [0]
+    for j in range(1, len(cuts)):
+        s_max = np.maximum.accumulate(s[:j][::-1])[::-1]
+        b_max = np.maximum.accumulate(b[:j][::-1])[::-1]
+        count = cuts[j] - cuts[:j]
+        costs = np.array(best) + LAUNCH_COST + count * s_max * (s_max + 2.0 * b_max)
+        best.append(costs.min())
+        start.append(int(costs.argmin()))
+    label, j = np.zeros(len(own), np.int64), len(cuts) - 1
+    while j > 0:
+        label[order[cuts[start[j]] : cuts[j]]] = start[j]
+        j = start[j]
+    return np.unique(label, return_inverse=True)[1], best[-1]
+
+
+def _own_size(tree, head, end):
+    """Unknowns that each part of depth `head` eliminates when the depths up to `end` are merged."""
+    n_parts = len(tree.own_size[head])
+    return sum(tree.own_size[depth].reshape(n_parts, -1).sum(1) for depth in range(head, end))
+
+
+def _count_entries(tree):
+    sizes = zip(tree.own_size, tree.boundary_size, strict=True)
+    return int(sum((s * (s + 1) // 2 + s * b).sum() for s, b in sizes))
+
+
+def _locate(tree, heads, node) -> Unknowns:
+    """Stage, front and position of every unknown."""
+    n = len(node)
+    stage_of_depth = np.searchsorted(heads, np.arange(len(tree.own_size)), side="right") - 1
+    stage = stage_of_depth[tree.depth[node]]
+    front = tree.part[node] >> (tree.depth[node] - np.asarray(heads)[stage])
+    rank = np.empty(n, np.int64)
+    rank[np.lexsort((np.arange(n), tree.rank[node]))] = np.arange(n)
+    order = np.lexsort((rank, front, stage))
+    group = (stage * n + front)[order]
+    local = np.empty(n, np.int64)
+    local[order] = np.arange(n) - np.searchsorted(group, group)
+    return Unknowns(stage, front, local, rank)
+
+
+def _unknowns_of(parts, nodes, node, sizes, rank):
+    """Spread pairs (part, node) to pairs (part, unknown): key part * n + rank, and the unknown."""
+    n = len(node)
+    members = np.argsort(node, kind="stable")
+    starts = np.cumsum(sizes) - sizes
+    count = sizes[nodes]
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    unknowns = members[np.repeat(starts[nodes], count) + within]
+    return np.repeat(parts, count) * n + rank[unknowns], unknowns

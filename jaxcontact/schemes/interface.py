@@ -1,0 +1,78 @@
+"""What a time-stepping scheme is: an option object that prepares operators and makes a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+from jax import Array
+
+from jaxcontact.contact import ContactProblem
+from jaxcontact.sparse import SymmetricMatrix
+from jaxcontact.system import System
+
+
+class StepState(NamedTuple):
+    """What one step hands to the next."""
+
+    displacement: Array
+    """y, (n,) [m]."""
+
+    velocity: Array
+    """v, (n,) [m/s]."""
+
+    impulse: Array
+    """Contact impulse lam of the last step, (C,) [N s]."""
+
+    active: Array
+    """Active contact pairs of the last step, (C,) bool."""
+
+
+class StepInfo(NamedTuple):
+    """How the contact problems of a step were solved."""
+
+    iterations: Array
+    """Iterations of the contact solver, int32."""
+
+    status: Array
+    """Worst `Status` of the step, int32."""
+
+    residual: Array
+    """Largest relative KKT residual of the step, scalar."""
+
+
+class EnergyFlow(NamedTuple):
+    """Where the energy of a step went; each scalar, [J]."""
+
+    work: Array
+    """Work of the loads on the body."""
+
+    viscous_loss: Array
+    """Energy dissipated by the viscosity, not negative."""
+
+    impact_loss: Array
+    """Energy taken by the contact (negative: contact has added energy)."""
+
+
+#: Makes the contact problem of an SPD matrix with the system's contact normals.
+ProblemFactory = Callable[[SymmetricMatrix], ContactProblem]
+
+
+class Scheme(Protocol):
+    """A time-stepping scheme: static, hashable, without arrays."""
+
+    def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> Any:
+        """Return the operators of the scheme, a pytree with at least `.mass`."""
+        ...
+
+    def step(
+        self, system: System, operators: Any, dt: Array, state: StepState, load: Array
+    ) -> tuple[StepState, StepInfo]:
+        """Advance by one step under the constant load (n,) [N]."""
+        ...
+
+    def energy_flow(
+        self, system: System, operators: Any, dt: Array, old: StepState, new: StepState, load: Array
+    ) -> EnergyFlow:
+        """Return the energy flow of a step that was made."""
+        ...

@@ -1,0 +1,192 @@
+"""The time loop: one contact problem per step, scanned."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact.contact import Status
+from jaxcontact.schemes import StepState
+from jaxcontact.stepper import Stepper
+from jaxcontact.trajectory import State, Trajectory
+
+
+class SolveError(RuntimeError):
+    """A time step was not solved; the message names step, time and what to try."""
+
+
+def simulate(
+    stepper: Stepper,
+    control: Array | None = None,
+    *,
+    steps: int | None = None,
+    initial: State | None = None,
+) -> Trajectory:
+    """Simulate the motion of the body.
+
+    Pure: can be put under jit, grad, vmap (over control, initial state and the values of the
+    stepper) with the stepper as an argument. A new control of the same shape compiles nothing.
+
+    Args:
+        stepper: from `prepare`.
+        control: force density u, (T, N, d) [N/m^d], piecewise constant in time and P1 in space;
+            None is none.
+        steps: number of steps T; default the length of the control.
+        initial: state at time zero; default at rest without displacement.
+
+    Returns:
+        The trajectory of T steps.
+
+    Raises:
+        ValueError: if shapes do not fit, a value is not finite, or the initial state penetrates
+            an obstacle or moves a clamped node.
+        SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
+            the trajectory is NaN from that step on instead.
+
+    Derivative: reverse mode of every order by control, initial state and every value of the
+    stepper; at weak contact the one of Algorithm 1 (the whole active set is strong).
+    """
+    steps = _check_steps(stepper, control, steps)
+    initial = _check_initial(stepper, initial)
+    trajectory = _run(stepper, control, initial, steps)
+    if not isinstance(trajectory.status, jax.core.Tracer):
+        _raise_if_failed(trajectory)
+    return trajectory
+
+
+@partial(jax.jit, static_argnames="steps")
+def _run(stepper: Stepper, control: Array | None, initial: State, steps: int) -> Trajectory:
+    system, dt = stepper.system, stepper.dt
+    start = StepState(
+        displacement=system.restrict(initial.displacement),
+        velocity=system.restrict(initial.velocity),
+        impulse=jnp.zeros(system.normals.count, system.dtype),
+        active=jnp.zeros(system.normals.count, bool),
+    )
+
+    def advance(state: StepState, force: Array | None):
+        load = system.load if force is None else system.load + system.control_load(force)
+        state, info = stepper.scheme.step(system, stepper.operators, dt, state, load)
+        return state, (state, info)
+
+    _, (states, info) = jax.lax.scan(advance, start, control, length=steps)
+
+    def with_start(first: Array, rest: Array) -> Array:
+        return jnp.concatenate([first[None], rest])
+
+    displacement = with_start(start.displacement, states.displacement)
+    normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
+    return Trajectory(
+        time=dt * jnp.arange(steps + 1),
+        displacement=system.lift(displacement),
+        velocity=system.lift(with_start(start.velocity, states.velocity)),
+        gap=system.gap[None, :] - normal_displacement,
+        contact_impulse=states.impulse,
+        active=states.active,
+        iterations=info.iterations,
+        status=info.status,
+        residual=info.residual,
+    )
+
+
+def _check_steps(stepper: Stepper, control: Array | None, steps: int | None) -> int:
+    """Return the number of steps that control and steps agree on."""
+    if control is None and steps is None:
+        raise ValueError("give a control (T, N, d) or the number of steps")
+    if control is not None:
+        system = stepper.system
+        expected = (system.n_nodes, system.dimension)
+        if np.ndim(control) != 3 or np.shape(control)[1:] != expected:
+            raise ValueError(
+                f"control must have shape (T, N, d) = (T, {expected[0]}, {expected[1]}), got "
+                f"{np.shape(control)}; it lives on all nodes, the clamped ones included"
+            )
+        _check_finite("control", control)
+        if steps is not None and steps != np.shape(control)[0]:
+            raise ValueError(
+                f"steps={steps} does not fit a control of {np.shape(control)[0]} steps; leave "
+                "steps out or cut the control"
+            )
+    n_steps = steps if control is None else np.shape(control)[0]
+    if n_steps is None or n_steps < 1:
+        raise ValueError(f"a simulation needs at least one step, got {n_steps}")
+    return n_steps
+
+
+def _check_initial(stepper: Stepper, initial: State | None) -> State:
+    system = stepper.system
+    shape = (system.n_nodes, system.dimension)
+    if initial is None:
+        rest = jnp.zeros(shape, system.dtype)
+        return State(rest, rest)
+    for name in ("displacement", "velocity"):
+        value = getattr(initial, name)
+        if np.shape(value) != shape:
+            raise ValueError(
+                f"initial.{name} must have shape (N, d) = {shape}, got {np.shape(value)}"
+            )
+        _check_finite(f"initial.{name}", value)
+        _check_clamped(system, name, value)
+    _check_penetration(system, initial.displacement)
+    return State(
+        jnp.asarray(initial.displacement, system.dtype), jnp.asarray(initial.velocity, system.dtype)
+    )
+
+
+def _is_concrete(*values) -> bool:
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def _check_finite(name: str, value: Array) -> None:
+    if _is_concrete(value) and not bool(jnp.all(jnp.isfinite(jnp.asarray(value)))):
+        bad = np.argwhere(~np.isfinite(np.asarray(value)))
+        raise ValueError(
+            f"{name} holds {len(bad)} values that are not finite, first at {tuple(bad[0].tolist())}"
+        )
+
+
+def _check_clamped(system, name: str, value: Array) -> None:
+    if not _is_concrete(value, system.node_numbers):
+        return
+    is_clamped = np.asarray(system.node_numbers) == len(system.free_nodes)
+    moved = np.flatnonzero(is_clamped & np.any(np.asarray(value) != 0.0, axis=1))
+    if moved.size:
+        raise ValueError(
+            f"initial.{name} is not zero on {moved.size} clamped nodes, first {moved[:5].tolist()}"
+        )
+
+
+def _check_penetration(system, displacement: Array) -> None:
+    if not _is_concrete(system, displacement):
+        return
+    y = system.restrict(jnp.asarray(displacement, system.dtype))
+    gap = np.asarray(system.gap - system.normals @ y)
+    size = np.max(np.abs(np.asarray(system.gap)), initial=0.0) + np.max(np.abs(np.asarray(y)))
+    deepest = int(np.argmin(gap)) if gap.size else 0
+    if gap.size and gap[deepest] < -64 * np.finfo(gap.dtype).eps * size:
+        count = np.count_nonzero(gap < 0.0)
+        raise ValueError(
+            f"the initial state penetrates the obstacle at {count} contact nodes, deepest at node "
+            f"{int(system.contact_nodes[deepest])} by {-gap[deepest]:.3g} m; move the obstacle or "
+            "give an initial displacement with an open gap"
+        )
+
+
+def _raise_if_failed(trajectory: Trajectory) -> None:
+    status = np.asarray(trajectory.status)
+    failed = np.flatnonzero(status > Status.FALLBACK)
+    if not failed.size:
+        return
+    step = int(failed[0])
+    reason = Status(int(status[step])).name.lower().replace("_", " ")
+    raise SolveError(
+        f"step {step + 1} of {status.size} (time {float(trajectory.time[step + 1]):.6g} s) ended "
+        f"as {reason} after {int(trajectory.iterations[step])} iterations of the contact solver, "
+        f"relative KKT residual {float(trajectory.residual[step]):.2e}; "
+        "reduce dt, check the loads for overflow, or allow more steps, for instance "
+        "contact_solver=jc.SemismoothNewton(max_steps=100)"
+    )

@@ -1,0 +1,228 @@
+"""From a scene to its matrices: the semi-discrete system of MATH.md 1.
+
+    M y'' + B y' + A y + N^T p = f,    N y <= psi,  p >= 0,  p . (psi - N y) = 0
+
+on the n unknowns: the displacement components of the nodes that are not clamped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact import assembly
+from jaxcontact.obstacle import gap_and_normals
+from jaxcontact.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
+from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class System:
+    """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
+
+    mass: SymmetricMatrix
+    """M, consistent mass matrix with density, (n, n) [kg]."""
+
+    stiffness: SymmetricMatrix
+    """A, elastic stiffness matrix, (n, n) [N/m]."""
+
+    viscosity: SymmetricMatrix | None
+    """B, viscosity matrix, (n, n) [N s/m]; None if the material has no viscosity."""
+
+    l2_mass: SymmetricMatrix
+    """L on the unknowns: mass matrix without density, (n, n) [m^d]."""
+
+    nodal_mass: SymmetricMatrix
+    """Scalar L on all nodes, (N, N) [m^d]; the inner product of controls (N, d), clamped too."""
+
+    normals: ContactNormals
+    """N, contact operator, (C, n); rows point from the body to the obstacle."""
+
+    gap: Array
+    """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
+
+    load: Array
+    """Constant load of body force and traction, (n,) [N]."""
+
+    contact_nodes: np.ndarray
+    """Node of each contact pair, (C,) int32."""
+
+    contact_area: Array
+    """Integral of the hat function over the contact set, (C,) [m^(d-1)]; impulse / (dt area)
+    is the contact pressure."""
+
+    points: Array
+    """Node positions in the reference configuration, (N, d) [m]."""
+
+    free_nodes: np.ndarray
+    """Nodes that are not clamped, (n/d,) int32."""
+
+    node_numbers: np.ndarray
+    """Position of each node among the free ones, (N,) int32; n/d for a clamped node."""
+
+    dimension: int = field(metadata={"static": True})
+    """Space dimension d."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, n."""
+        return self.load.shape[-1]
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of mesh nodes, N."""
+        return self.points.shape[-2]
+
+    @property
+    def dtype(self):
+        """Floating point type of every array."""
+        return self.load.dtype
+
+    def lift(self, x: Array) -> Array:
+        """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
+        return _lift(self, x)
+
+    def restrict(self, y: Array) -> Array:
+        """Return the unknowns (..., n) of a nodal field (..., N, d)."""
+        return _restrict(self, y)
+
+    def control_load(self, control: Array) -> Array:
+        """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
+        return self.restrict(self.nodal_mass @ control)
+
+
+def discretize(scene: Scene, dtype=jnp.float64) -> System:
+    """Assemble the P1 system of a scene.
+
+    Traceable in material, obstacles, loads and node positions; the connectivity and the names
+    must be concrete.
+
+    Args:
+        scene: the scene.
+        dtype: floating point type, float64 or float32.
+
+    Returns:
+        The system, with n = d (number of nodes that are not clamped) unknowns.
+
+    Raises:
+        ValueError: if the scene is inconsistent (see `check_scene`) or leaves nothing to move.
+        RuntimeError: if float64 is asked for while JAX has it switched off.
+    """
+    dtype = jnp.dtype(dtype)
+    _check_dtype(dtype)
+    check_scene(scene)
+    mesh, dimension = scene.mesh, scene.mesh.dimension
+    points = jnp.asarray(mesh.points, dtype)
+    cells = np.asarray(mesh.cells)
+
+    is_free = np.ones(mesh.n_nodes, bool)
+    is_free[clamped_nodes(scene)] = False
+    free_nodes = np.flatnonzero(is_free).astype(np.int32)
+    if free_nodes.size == 0:
+        raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
+    numbers = np.where(is_free, np.cumsum(is_free) - 1, -1)
+
+    gradients, volumes = assembly.hat_gradients(points, cells)
+    l2_blocks = assembly.mass_blocks(volumes, dimension)
+    material = cellwise_material(scene)
+    density = jnp.broadcast_to(jnp.asarray(material.density, dtype), volumes.shape)
+    pattern = assembly.node_pattern(cells, numbers)
+    columns = assembly.matrix_columns(pattern, dimension)
+
+    def vector_mass(blocks: Array) -> SymmetricMatrix:
+        scalar = assembly.assemble(pattern, blocks)
+        return SymmetricMatrix(assembly.repeat_scalar(scalar, dimension), columns)
+
+    def isotropic(lame: tuple) -> SymmetricMatrix:
+        blocks = assembly.stiffness_blocks(gradients, volumes, lame)
+        return SymmetricMatrix(assembly.assemble(pattern, blocks), columns)
+
+    all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
+    nodes, gap, vectors, area = _contact_pairs(scene, points)
+    components = np.arange(dimension, dtype=np.int32)
+    unknowns = numbers[nodes].astype(np.int32)[:, None] * dimension + components[None, :]
+
+    return System(
+        mass=vector_mass(density[:, None, None, None, None] * l2_blocks),
+        stiffness=isotropic(material.elastic_lame()),
+        viscosity=None if is_elastic(scene) else isotropic(material.viscous_lame()),
+        l2_mass=vector_mass(l2_blocks),
+        nodal_mass=assembly.scalar_matrix(all_nodes, l2_blocks),
+        normals=ContactNormals(vectors, unknowns),
+        gap=gap,
+        load=_constant_load(scene, points, volumes)[free_nodes].reshape(-1),
+        contact_nodes=nodes,
+        contact_area=area,
+        points=points,
+        free_nodes=free_nodes,
+        node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
+        dimension=dimension,
+    )
+
+
+def _check_dtype(dtype) -> None:
+    if dtype not in (jnp.float32, jnp.float64):
+        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
+    if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
+            "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
+        )
+
+
+def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Array, Array]:
+    """Return node (C,), gap (C,), normal (C, d) and area (C,) of every contact pair."""
+    nodes, gaps, normals, areas = [], [], [], []
+    for name in sorted(scene.contact):
+        facets = np.asarray(scene.mesh.facets[name])
+        set_nodes = np.unique(facets)
+        gap, vectors = gap_and_normals(scene.contact[name], points[set_nodes])
+        nodes.append(set_nodes)
+        gaps.append(gap)
+        normals.append(vectors)
+        areas.append(assembly.nodal_areas(points, facets)[set_nodes])
+    if not nodes:
+        nothing = jnp.zeros(0, points.dtype)
+        return (
+            np.zeros(0, np.int32),
+            nothing,
+            jnp.zeros((0, points.shape[1]), points.dtype),
+            nothing,
+        )
+    return (
+        np.concatenate(nodes).astype(np.int32),
+        jnp.concatenate(gaps),
+        jnp.concatenate(normals),
+        jnp.concatenate(areas),
+    )
+
+
+def _constant_load(scene: Scene, points: Array, volumes: Array) -> Array:
+    """Return the consistent nodal forces of body force and tractions, (N, d) [N]."""
+    load = jnp.zeros(points.shape, points.dtype)
+    if scene.body_force is not None:
+        n_local = scene.mesh.dimension + 1
+        shares = jnp.repeat(volumes / n_local, n_local)
+        weights = jnp.zeros(points.shape[0], points.dtype)
+        weights = weights.at[np.ravel(scene.mesh.cells)].add(shares)
+        load = load + weights[:, None] * jnp.asarray(scene.body_force, points.dtype)[None, :]
+    for name, traction in scene.traction.items():
+        weights = assembly.nodal_areas(points, np.asarray(scene.mesh.facets[name]))
+        load = load + weights[:, None] * jnp.asarray(traction, points.dtype)[None, :]
+    return load
+
+
+def _restrict(system: System, y: Array) -> Array:
+    free = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
+    return free.reshape(*y.shape[:-2], system.size)
+
+
+def _lift(system: System, x: Array) -> Array:
+    free = x.reshape(*x.shape[:-1], -1, system.dimension)
+    padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
+    return jnp.take(jnp.concatenate([free, padding], axis=-2), system.node_numbers, axis=-2)
