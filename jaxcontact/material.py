@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 Number = float | Array
 
@@ -54,7 +55,7 @@ class KelvinVoigt:
     def is_elastic(self) -> bool:
         """Return True if both viscosities are known to be zero (a traced viscosity is not)."""
         return all(
-            not isinstance(viscosity, jax.core.Tracer) and not np.any(viscosity)
+            not isinstance(viscosity, Tracer) and not np.any(viscosity)
             for viscosity in (self.bulk_viscosity, self.shear_viscosity)
         )
 
@@ -79,7 +80,7 @@ def check_material(material: KelvinVoigt) -> None:
                 f"KelvinVoigt.{name} must be a scalar, got shape {np.shape(value)}; give each "
                 "region its own material, Scene(material={region: KelvinVoigt(...)})"
             )
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             continue
         if not np.isfinite(value) or not is_admissible(float(value)):
             raise ValueError(f"KelvinVoigt.{name} must be {description}, got {value}")

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 
 class Obstacle(Protocol):
@@ -30,10 +31,10 @@ class Obstacle(Protocol):
 class HalfSpace:
     """The obstacle {x: normal . (x - point) <= 0}, bounded by a plane (2D: line, 1D: point)."""
 
-    point: Array
+    point: Array | np.ndarray
     """A point of the bounding plane, (d,) [m]."""
 
-    normal: Array
+    normal: Array | np.ndarray
     """Normal of the plane, (d,), of any positive length; points from the obstacle to the body."""
 
     def signed_distance(self, x: Array) -> Array:
@@ -48,7 +49,7 @@ class HalfSpace:
 class Ball:
     """The ball (2D: disc) of the given centre and radius."""
 
-    center: Array
+    center: Array | np.ndarray
     """Centre, (d,) [m]."""
 
     radius: float | Array
@@ -89,7 +90,7 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
     check_obstacle(obstacle, points.shape[1])
     gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
     length = jnp.linalg.norm(gradient, axis=1, keepdims=True)
-    if not isinstance(length, jax.core.Tracer) and not np.all(np.asarray(length) > 0.0):
+    if not isinstance(length, Tracer) and not np.all(np.asarray(length) > 0.0):
         raise ValueError(
             f"the signed distance of {type(obstacle).__name__} has a zero or undefined gradient "
             "at a contact node, so no contact normal exists there; is a node at the centre?"
@@ -111,12 +112,12 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
         where = f"{type(obstacle).__name__}.{name}"
         if np.shape(value) != (dimension,):
             raise ValueError(f"{where} must have shape ({dimension},), got {np.shape(value)}")
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             continue
         if not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"{where} must be finite, got {value}")
         if name == "normal" and not np.any(value):
             raise ValueError(f"{where} must not be the zero vector")
     radius = getattr(obstacle, "radius", None)
-    if radius is not None and not isinstance(radius, jax.core.Tracer) and not radius > 0.0:
+    if radius is not None and not isinstance(radius, Tracer) and not radius > 0.0:
         raise ValueError(f"Ball.radius must be positive, got {radius}")

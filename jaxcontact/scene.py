@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxcontact.material import KelvinVoigt, check_material
 from jaxcontact.mesh import Mesh
@@ -36,10 +37,10 @@ class Scene:
     contact: Mapping[str, Obstacle] = field(default_factory=dict)
     """Facet sets that may touch, with the obstacle that each may touch."""
 
-    traction: Mapping[str, Array] = field(default_factory=dict)
+    traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
     """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
 
-    body_force: Array | None = None
+    body_force: Array | np.ndarray | None = None
     """Constant volume force, (d,) [N/m^d]; None is none."""
 
 
@@ -103,7 +104,7 @@ def is_elastic(scene: Scene) -> bool:
 def _check_vector(name: str, vector: Any, dimension: int) -> None:
     if np.shape(vector) != (dimension,):
         raise ValueError(f"{name} must have shape ({dimension},), got {np.shape(vector)}")
-    if not isinstance(vector, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(vector))):
+    if not isinstance(vector, Tracer) and not np.all(np.isfinite(np.asarray(vector))):
         raise ValueError(f"{name} must be finite, got {vector}")
 
 

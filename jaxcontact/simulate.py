@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxcontact.contact import Status
 from jaxcontact.schemes import StepState
@@ -53,7 +54,7 @@ def simulate(
     steps = _check_steps(stepper, control, steps)
     initial = _check_initial(stepper, initial)
     trajectory = _run(stepper, control, initial, steps)
-    if not isinstance(trajectory.status, jax.core.Tracer):
+    if not isinstance(trajectory.status, Tracer):
         _raise_if_failed(trajectory)
     return trajectory
 
@@ -138,7 +139,7 @@ def _check_initial(stepper: Stepper, initial: State | None) -> State:
 
 
 def _is_concrete(*values) -> bool:
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _check_finite(name: str, value: Array) -> None:

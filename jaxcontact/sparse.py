@@ -30,7 +30,7 @@ class SymmetricMatrix:
     values: Array
     """Entries, (width, n); padded entries are zero."""
 
-    columns: Array
+    columns: Array | np.ndarray
     """Column of each entry, (width, n) int32; padded entries name their own row."""
 
     @property
@@ -76,7 +76,7 @@ class ContactNormals:
     weights: Array
     """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i."""
 
-    unknowns: Array
+    unknowns: Array | np.ndarray
     """Unknown of each entry, (C, k) int32."""
 
     @property
@@ -101,12 +101,12 @@ class ContactNormals:
         return scipy.sparse.coo_array(entries, shape=(self.count, size)).tocsr()
 
 
-def take(x: Array, index: Array) -> Array:
+def take(x: Array, index: Array | np.ndarray) -> Array:
     """Return x[index] along the first axis for an index that is known to be in bounds."""
     return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _gathered_product(values: Array, columns: Array, x: Array) -> Array:
+def _gathered_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
     """Return sum_j values[j] * x[columns[j]]; the loop over the short rows is unrolled."""
     if x.ndim == 2:
         values = values[:, :, None]
@@ -118,7 +118,7 @@ def _gathered_product(values: Array, columns: Array, x: Array) -> Array:
     return product
 
 
-def _linear_product(values: Array, columns: Array, x: Array) -> Array:
+def _linear_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
     """Return the product as a linear map of x that is declared to be its own transpose.
 
     `custom_linear_solve` is the one construct of JAX that lets a linear map state its transpose
@@ -134,7 +134,7 @@ def _linear_product(values: Array, columns: Array, x: Array) -> Array:
 
 
 @jax.custom_jvp
-def _symmetric_product(values: Array, columns: Array, x: Array) -> Array:
+def _symmetric_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
     return _gathered_product(values, columns, x)
 
 

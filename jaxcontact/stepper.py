@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton
 from jaxcontact.linear import Dense, LinearSolver
@@ -86,9 +87,9 @@ def prepare(
     ):
         if isinstance(option, type | str):
             raise ValueError(f"{name} must be an object, such as jc.{scheme}(), got {option!r}")
-    if not isinstance(dt, jax.core.Tracer) and not (np.isfinite(dt) and dt > 0.0):
+    if not isinstance(dt, Tracer) and not (np.isfinite(dt) and dt > 0.0):
         raise ValueError(f"dt must be a positive number of seconds, got {dt}")
-    if isinstance(system.mass.columns, jax.core.Tracer):
+    if isinstance(system.mass.columns, Tracer):
         raise ValueError(
             "the sparsity pattern of the system is traced; call prepare outside jax.jit, or build "
             "mesh and scene inside the transformed function so that only values are traced"
@@ -112,7 +113,7 @@ def prepare(
 
 def _coordinates(system: System) -> np.ndarray | None:
     """Return the positions of the unknowns, (n, d), if they are concrete."""
-    if isinstance(system.points, jax.core.Tracer):
+    if isinstance(system.points, Tracer):
         return None
     return np.repeat(np.asarray(system.points)[system.free_nodes], system.dimension, axis=0)
 
@@ -120,7 +121,7 @@ def _coordinates(system: System) -> np.ndarray | None:
 def _check_factor(factor: Any, matrix: SymmetricMatrix) -> None:
     """Check a concrete factor by solving with it once."""
     probe = factor.solve(jnp.ones(matrix.size, matrix.values.dtype))
-    if isinstance(probe, jax.core.Tracer):
+    if isinstance(probe, Tracer):
         return
     if not np.all(np.isfinite(np.asarray(probe))):
         raise ValueError(

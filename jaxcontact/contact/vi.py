@@ -40,10 +40,10 @@ from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 class Fixed(NamedTuple):
     """What a step uses and never differentiates."""
 
-    columns: Array
+    columns: Array | np.ndarray
     """Sparsity of D, (width, n) int32."""
 
-    unknowns: Array
+    unknowns: Array | np.ndarray
     """Sparsity of N, (C, k) int32."""
 
     factor: Factor
@@ -201,14 +201,14 @@ def _solve_forward_jvp(contact_solver, primals, tangents):
 
 def _zero_if_symbolic(tangent: Any) -> Array:
     if isinstance(tangent, SymbolicZero):
-        return jnp.zeros(tangent.aval.shape, tangent.aval.dtype)
+        return jnp.zeros(tangent.shape, tangent.dtype)
     return tangent
 
 
 def _tangent(solution: Solution, multiplier_dot: Array) -> Solution:
     """Return the tangent of a solution: only the multiplier has one."""
 
-    def nothing(leaf: Array) -> Array:
+    def nothing(leaf: Array) -> np.ndarray:
         is_float = jnp.issubdtype(leaf.dtype, jnp.floating)
         return np.zeros(leaf.shape, leaf.dtype if is_float else jax.dtypes.float0)
 
@@ -275,7 +275,7 @@ def _solve_bwd(contact_solver, residuals, cotangents):
     values_bar = weights_bar = None
     if velocity is not None:
         values_bar = -rhs_bar[None, :] * velocity[fixed.columns]
-    if multiplier is not None:
+    if velocity is not None and multiplier is not None:
         weights_bar = -(
             multiplier[:, None] * rhs_bar[fixed.unknowns]
             + bound_bar[:, None] * velocity[fixed.unknowns]
