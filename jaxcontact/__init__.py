@@ -10,7 +10,7 @@ from jaxcontact.cost import TrackingCost
 from jaxcontact.energy import Energy, energy
 from jaxcontact.inner_product import l2_value_and_grad
 from jaxcontact.io import read_mesh
-from jaxcontact.linear import Dense
+from jaxcontact.linear import ConjugateGradient, Dense
 from jaxcontact.material import KelvinVoigt
 from jaxcontact.mesh import Mesh
 from jaxcontact.obstacle import Ball, HalfSpace, SignedDistance
@@ -23,6 +23,7 @@ from jaxcontact.trajectory import State, Trajectory
 
 __all__ = [
     "Ball",
+    "ConjugateGradient",
     "ContactImplicit",
     "Dense",
     "Energy",

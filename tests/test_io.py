@@ -18,19 +18,20 @@ PHYSICAL = {
     "field_data": {name: np.array(tag) for name, tag in [("bottom", [1, 1]), ("body", [3, 2])]},
 }
 
-# Written by hand after the format's specification: meshio writes no entities.
+# Written by hand after the format's specification: meshio writes no entities. Both groups have the
+# number 7, which Gmsh allows in different dimensions.
 GMSH41 = """$MeshFormat
 4.1 0 8
 $EndMeshFormat
 $PhysicalNames
 2
 1 7 "bottom"
-2 9 "body"
+2 7 "body"
 $EndPhysicalNames
 $Entities
 0 1 1 0
 1 0 0 0 1 0 0 1 7 0
-1 0 0 0 1 1 0 1 9 1 1
+1 0 0 0 1 1 0 1 7 1 1
 $EndEntities
 $Nodes
 1 4 1 4

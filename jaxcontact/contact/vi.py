@@ -27,6 +27,7 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero, custom_vjp_primal_tree_values
 
+from jaxcontact.contact import matrix_free
 from jaxcontact.contact.complementarity import (
     ContactSolver,
     Solution,
@@ -34,6 +35,7 @@ from jaxcontact.contact.complementarity import (
     solve_on_set,
 )
 from jaxcontact.linear import Factor
+from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -140,26 +142,29 @@ def solve_on_cone(
     matrix = SymmetricMatrix(values, fixed.columns)
     normals = ContactNormals(weights, fixed.unknowns)
 
+    n = rhs.shape[0]
+
+    # One vector (w, p): custom_linear_solve fails where only one of two parts has a tangent.
     def saddle_point(unknowns):
-        w, p = unknowns
+        w, p = unknowns[:n], unknowns[n:]
         p_active = jnp.where(active, p, 0.0)
         stretch = normals @ w if softness is None else normals @ w - softness * p
-        return (
-            matrix @ w + normals.transposed_product(p_active, w.shape[0]),
-            jnp.where(active, stretch, p),
-        )
+        balance = matrix @ w + normals.transposed_product(p_active, n)
+        return jnp.concatenate([balance, jnp.where(active, stretch, p)])
 
     factor, frozen_softness = jax.lax.stop_gradient((fixed.factor, softness))
 
     def solve(_, data):
-        r, b = data
+        r, b = data[:n], data[n:]
+        if isinstance(factor, IterativeFactor):
+            return jnp.concatenate(factor.solve_on_set(active, r, b))
         partial_sweep, free = factor.condense(r)
         p = solve_on_set(factor.compliance, active, frozen_softness, jnp.where(active, free - b, b))
-        w = factor.expand(partial_sweep, jnp.where(active, p, 0.0))
-        return w, p
+        return jnp.concatenate([factor.expand(partial_sweep, jnp.where(active, p, 0.0)), p])
 
-    data = (rhs, jnp.where(active, bound, 0.0))
-    return jax.lax.custom_linear_solve(saddle_point, data, solve, symmetric=True)
+    data = jnp.concatenate([rhs, jnp.where(active, bound, 0.0)])
+    solution = jax.lax.custom_linear_solve(saddle_point, data, solve, symmetric=True)
+    return solution[:n], solution[n:]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -173,6 +178,10 @@ def solve_forward(
 ) -> tuple[Array, Solution]:
     """Solve the VI; forward-mode derivative on the active set. See `ContactProblem.solve`."""
     factor = fixed.factor
+    if isinstance(factor, IterativeFactor):
+        return matrix_free.solve_contact(
+            factor, contact_solver.max_steps, rhs, bound, fixed.resolution, fixed.guess
+        )
     partial_sweep, free = factor.condense(rhs)
     solution = contact_solver.solve(factor.compliance, bound - free, fixed.resolution, fixed.guess)
     return factor.expand(partial_sweep, solution.multiplier), solution

@@ -4,7 +4,8 @@ A solver is an option object with one method, `factorize`; the factor answers wh
 of the matrix D: solve with it, and solve a contact problem on it in one sweep (MATH.md 2).
 """
 
+from jaxcontact.linear.conjugate_gradient import ConjugateGradient
 from jaxcontact.linear.dense import Dense
 from jaxcontact.linear.interface import Factor, LinearSolver
 
-__all__ = ["Dense", "Factor", "LinearSolver"]
+__all__ = ["ConjugateGradient", "Dense", "Factor", "LinearSolver"]
