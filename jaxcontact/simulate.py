@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxcontact.contact import Status
 from jaxcontact.schemes import StepState
 from jaxcontact.stepper import Stepper
+from jaxcontact.time_loop import Checkpoint, scan_steps
 from jaxcontact.trajectory import State, Trajectory
 
 
@@ -26,6 +27,8 @@ def simulate(
     *,
     steps: int | None = None,
     initial: State | None = None,
+    save_every: int = 1,
+    checkpoint: Checkpoint | None = None,
 ) -> Trajectory:
     """Simulate the motion of the body.
 
@@ -38,6 +41,10 @@ def simulate(
             None is none.
         steps: number of steps T; default the length of the control.
         initial: state at time zero; default at rest without displacement.
+        save_every: number of steps k between recorded states, a divisor of T: displacement,
+            velocity, gap and time then have T/k + 1 levels; contact records keep all T steps.
+        checkpoint: `Checkpoint(segments)` lets the backward pass recompute the steps of a segment
+            instead of storing them; same gradient to rounding, about one more forward run.
 
     Returns:
         The trajectory of T steps.
@@ -52,29 +59,43 @@ def simulate(
     stepper; at weak contact the one of Algorithm 1 (the whole active set is strong).
     """
     steps = _check_steps(stepper, control, steps)
+    if save_every < 1 or steps % save_every:
+        raise ValueError(
+            f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
+        )
     initial = _check_initial(stepper, initial)
-    trajectory = _run(stepper, control, initial, steps)
+    trajectory = _run(stepper, control, initial, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
         _raise_if_failed(trajectory)
     return trajectory
 
 
-@partial(jax.jit, static_argnames="steps")
-def _run(stepper: Stepper, control: Array | None, initial: State, steps: int) -> Trajectory:
+@partial(jax.jit, static_argnames=("steps", "save_every", "checkpoint"))
+def _run(
+    stepper: Stepper,
+    control: Array | None,
+    initial: State,
+    steps: int,
+    save_every: int,
+    checkpoint: Checkpoint | None,
+) -> Trajectory:
     system, dt = stepper.system, stepper.dt
     start = StepState(
         displacement=system.restrict(initial.displacement),
         velocity=system.restrict(initial.velocity),
         impulse=jnp.zeros(system.normals.count, system.dtype),
         active=jnp.zeros(system.normals.count, bool),
+        memory=stepper.scheme.memory(system),
     )
 
     def advance(state: StepState, force: Array | None):
         load = system.load if force is None else system.load + system.control_load(force)
         state, info = stepper.scheme.step(system, stepper.operators, dt, state, load)
-        return state, (state, info)
+        return state, (state.impulse, state.active, info)
 
-    _, (states, info) = jax.lax.scan(advance, start, control, length=steps)
+    states, (impulse, active, info) = scan_steps(
+        advance, start, control, steps, save_every, checkpoint
+    )
 
     def with_start(first: Array, rest: Array) -> Array:
         return jnp.concatenate([first[None], rest])
@@ -82,12 +103,12 @@ def _run(stepper: Stepper, control: Array | None, initial: State, steps: int) ->
     displacement = with_start(start.displacement, states.displacement)
     normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
     return Trajectory(
-        time=dt * jnp.arange(steps + 1),
+        time=dt * jnp.arange(0, steps + 1, save_every),
         displacement=system.lift(displacement),
         velocity=system.lift(with_start(start.velocity, states.velocity)),
         gap=system.gap[None, :] - normal_displacement,
-        contact_impulse=states.impulse,
-        active=states.active,
+        contact_impulse=impulse,
+        active=active,
         iterations=info.iterations,
         status=info.status,
         residual=info.residual,
@@ -143,7 +164,7 @@ def _is_concrete(*values) -> bool:
 
 
 def _check_finite(name: str, value: Array) -> None:
-    if _is_concrete(value) and not bool(jnp.all(jnp.isfinite(jnp.asarray(value)))):
+    if _is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
         bad = np.argwhere(~np.isfinite(np.asarray(value)))
         raise ValueError(
             f"{name} holds {len(bad)} values that are not finite, first at {tuple(bad[0].tolist())}"
@@ -164,8 +185,10 @@ def _check_clamped(system, name: str, value: Array) -> None:
 def _check_penetration(system, displacement: Array) -> None:
     if not _is_concrete(system, displacement):
         return
-    y = system.restrict(jnp.asarray(displacement, system.dtype))
-    gap = np.asarray(system.gap - system.normals @ y)
+    # Concrete values stay concrete, also where the caller is under jit.
+    with jax.ensure_compile_time_eval():
+        y = system.restrict(jnp.asarray(displacement, system.dtype))
+        gap = np.asarray(system.gap - system.normals @ y)
     size = np.max(np.abs(np.asarray(system.gap)), initial=0.0) + np.max(np.abs(np.asarray(y)))
     deepest = int(np.argmin(gap)) if gap.size else 0
     if gap.size and gap[deepest] < -64 * np.finfo(gap.dtype).eps * size:
@@ -183,9 +206,10 @@ def _raise_if_failed(trajectory: Trajectory) -> None:
     if not failed.size:
         return
     step = int(failed[0])
+    time = float(trajectory.time[-1]) * (step + 1) / status.size
     reason = Status(int(status[step])).name.lower().replace("_", " ")
     raise SolveError(
-        f"step {step + 1} of {status.size} (time {float(trajectory.time[step + 1]):.6g} s) ended "
+        f"step {step + 1} of {status.size} (time {time:.6g} s) ended "
         f"as {reason} after {int(trajectory.iterations[step])} iterations of the contact solver, "
         f"relative KKT residual {float(trajectory.residual[step]):.2e}; "
         "reduce dt, check the loads for overflow, or allow more steps, for instance "
