@@ -9,29 +9,32 @@ symmetric its transpose is the same gather.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jax import Array
-from jax.custom_derivatives import SymbolicZero
+
+from jaxcontact.symmetric_product import symmetric_product, take
+
+__all__ = ["ContactNormals", "SymmetricMatrix", "take"]
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SymmetricMatrix:
-    """A sparse symmetric matrix of shape (n, n) in padded ELL layout.
+    """A symmetric matrix of shape (n, n), sparse in padded ELL layout or dense.
 
     Derivative: of any order, with respect to the entries (on the sparsity pattern) and the vector.
     """
 
     values: Array
-    """Entries, (width, n); padded entries are zero."""
+    """Entries, (width, n); padded entries are zero. Dense: (n, n)."""
 
-    columns: Array | np.ndarray
-    """Column of each entry, (width, n) int32; padded entries name their own row."""
+    columns: Array | np.ndarray | None
+    """Column of each entry, (width, n) int32; padded entries name their own row. None is dense
+    (a reduced model)."""
 
     @property
     def size(self) -> int:
@@ -40,7 +43,9 @@ class SymmetricMatrix:
 
     def __matmul__(self, x: Array) -> Array:
         """Return the product with a vector (n,) or with the columns of a matrix (n, r)."""
-        return _symmetric_product(self.values, self.columns, x)
+        if self.columns is None:
+            return self.values @ x
+        return symmetric_product(self.values, self.columns, x)
 
     def __add__(self, other: SymmetricMatrix) -> SymmetricMatrix:
         """Return the sum; both matrices must share one sparsity pattern."""
@@ -52,11 +57,23 @@ class SymmetricMatrix:
 
     def diagonal(self) -> Array:
         """Return the diagonal, (n,)."""
+        if self.columns is None:
+            return jnp.diagonal(self.values)
         on_diagonal = self.columns == jnp.arange(self.size, dtype=jnp.int32)[None, :]
         return jnp.sum(jnp.where(on_diagonal, self.values, 0.0), axis=0)
 
+    def to_dense(self) -> Array:
+        """Return the dense matrix, (n, n)."""
+        if self.columns is None:
+            return self.values
+        rows = jnp.broadcast_to(jnp.arange(self.size, dtype=jnp.int32)[None, :], self.columns.shape)
+        zeros = jnp.zeros((self.size, self.size), self.values.dtype)
+        return zeros.at[rows, self.columns].add(self.values)
+
     def to_scipy(self) -> scipy.sparse.csr_array:
         """Return a SciPy CSR copy (concrete matrices only)."""
+        if self.columns is None:
+            return scipy.sparse.csr_array(np.asarray(self.values))
         values, columns = np.asarray(self.values), np.asarray(self.columns)
         rows = np.broadcast_to(np.arange(self.size, dtype=np.int32), columns.shape)
         entries = (values.ravel(), (rows.ravel(), columns.ravel()))
@@ -99,53 +116,3 @@ class ContactNormals:
         rows = np.broadcast_to(np.arange(self.count)[:, None], unknowns.shape)
         entries = (np.asarray(self.weights).ravel(), (rows.ravel(), unknowns.ravel()))
         return scipy.sparse.coo_array(entries, shape=(self.count, size)).tocsr()
-
-
-def take(x: Array, index: Array | np.ndarray) -> Array:
-    """Return x[index] along the first axis for an index that is known to be in bounds."""
-    return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def _gathered_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
-    """Return sum_j values[j] * x[columns[j]]; the loop over the short rows is unrolled."""
-    if x.ndim == 2:
-        values = values[:, :, None]
-    # Without the barrier XLA recomputes the producer of x inside every one of the gathers.
-    x = jax.lax.optimization_barrier(x)
-    product = values[0] * take(x, columns[0])
-    for j in range(1, columns.shape[0]):
-        product = product + values[j] * take(x, columns[j])
-    return product
-
-
-def _linear_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
-    """Return the product as a linear map of x that is declared to be its own transpose.
-
-    `custom_linear_solve` is the one construct of JAX that lets a linear map state its transpose
-    and still supports vmap and every order of differentiation. `matvec` would be the inverse of
-    the matrix; it is never evaluated, because the entries are not differentiated through here.
-    """
-    return jax.lax.custom_linear_solve(
-        matvec=lambda y: y,
-        b=x,
-        solve=lambda _, b: _gathered_product(values, columns, b),
-        symmetric=True,
-    )
-
-
-@jax.custom_jvp
-def _symmetric_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
-    return _gathered_product(values, columns, x)
-
-
-@partial(_symmetric_product.defjvp, symbolic_zeros=True)
-def _symmetric_product_jvp(primals, tangents):
-    values, columns, x = primals
-    values_dot, _, x_dot = tangents
-    product = _linear_product(values, columns, x)
-    product_dot = jnp.zeros_like(product)
-    if not isinstance(x_dot, SymbolicZero):
-        product_dot = product_dot + _linear_product(values, columns, x_dot)
-    if not isinstance(values_dot, SymbolicZero):
-        product_dot = product_dot + _gathered_product(values_dot, columns, x)
-    return product, product_dot

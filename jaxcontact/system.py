@@ -22,6 +22,18 @@ from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Basis:
+    """The space of a reduced model: y = vectors q, with M-orthonormal vectors."""
+
+    vectors: Array
+    """Basis vectors, (n_full, n): displacement components of the free nodes."""
+
+    projector: Array
+    """M vectors, (n_full, n): q = projector^T y is the M-orthogonal projection."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class System:
     """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
 
@@ -68,6 +80,9 @@ class System:
     dimension: int = field(metadata={"static": True})
     """Space dimension d."""
 
+    basis: Basis | None = None
+    """Space of a reduced model (see `reduce`); None is all displacement components."""
+
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
@@ -88,12 +103,17 @@ class System:
         return _lift(self, x)
 
     def restrict(self, y: Array) -> Array:
-        """Return the unknowns (..., n) of a nodal field (..., N, d)."""
-        return _restrict(self, y)
+        """Return the unknowns (..., n) of a nodal field (..., N, d).
+
+        Of a reduced model, the unknowns of the M-orthogonal projection.
+        """
+        free = _free_components(self, y)
+        return free if self.basis is None else free @ self.basis.projector
 
     def control_load(self, control: Array) -> Array:
         """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
-        return self.restrict(self.nodal_mass @ control)
+        load = _free_components(self, self.nodal_mass @ control)
+        return load if self.basis is None else load @ self.basis.vectors
 
 
 def discretize(scene: Scene, dtype=jnp.float64) -> System:
@@ -217,12 +237,14 @@ def _constant_load(scene: Scene, points: Array, volumes: Array) -> Array:
     return load
 
 
-def _restrict(system: System, y: Array) -> Array:
+def _free_components(system: System, y: Array) -> Array:
     free = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
-    return free.reshape(*y.shape[:-2], system.size)
+    return free.reshape(*y.shape[:-2], -1)
 
 
 def _lift(system: System, x: Array) -> Array:
+    if system.basis is not None:
+        x = x @ system.basis.vectors.T
     free = x.reshape(*x.shape[:-1], -1, system.dimension)
     padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
     return jnp.take(jnp.concatenate([free, padding], axis=-2), system.node_numbers, axis=-2)

@@ -470,6 +470,14 @@ def test_bouncing_mass_impact_times_are_those_of_the_loop(mass):
     )
 
 
+@pytest.mark.parametrize("name", ["elastic", "nearly elastic", "inelastic"])
+def test_bouncing_mass_velocity_just_before_an_impact_is_the_incoming_one(name):
+    k = np.arange(20)
+    before = np.nextafter(impact_time(MASSES[name], k), 0)
+    expected = -MASSES[name].impact_speed(k)
+    np.testing.assert_allclose(velocity(MASSES[name], before), expected, atol=1e-11)
+
+
 def test_bouncing_mass_loses_the_square_of_the_restitution_per_impact():
     mass = MASSES["inelastic"]
     times = mass.impact_time(np.arange(6))

@@ -10,9 +10,9 @@ derivative and its transpose are the same symmetric saddle-point problem (4.40)-
 
     D dw + N^T dp = dr,    (N dw - s dp)_i = db_i on A,    dp_i = 0 elsewhere,
 
-with s = 0 for exact contact. It is solved by the factor of the forward step. All of A counts as
-strong contact (Algorithm 1 of the paper), so where weak contact is present the derivative is one
-element of the generalised Jacobian.
+with s = 0 for exact contact. It is solved by the factor of the forward step. Where weak contact is
+present the problem is not differentiable: `weak.py` names the choices of A, and `critical_cone.py`
+solves for the one-sided derivative.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_derivatives import SymbolicZero, custom_vjp_primal_tree_values
+from jax.custom_derivatives import SymbolicZero
 
-from jaxcontact.contact import matrix_free
+from jaxcontact.contact import critical_cone, matrix_free
 from jaxcontact.contact.complementarity import (
     ContactSolver,
     Solution,
     Status,
     solve_on_set,
 )
+from jaxcontact.contact.forward_only import forward_only
+from jaxcontact.contact.weak import CriticalCone, OnBranch, Strong, WeakContact
 from jaxcontact.linear import Factor
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
@@ -42,8 +44,8 @@ from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 class Fixed(NamedTuple):
     """What a step uses and never differentiates."""
 
-    columns: Array | np.ndarray
-    """Sparsity of D, (width, n) int32."""
+    columns: Array | np.ndarray | None
+    """Sparsity of D, (width, n) int32; None is dense."""
 
     unknowns: Array | np.ndarray
     """Sparsity of N, (C, k) int32."""
@@ -75,6 +77,9 @@ class ContactProblem:
     contact_solver: ContactSolver = field(metadata={"static": True})
     """How the condensed problem is solved."""
 
+    weak_contact: WeakContact = field(default=Strong(), metadata={"static": True})
+    """What the derivative means where a pair is in weak contact."""
+
     def solve(
         self, rhs: Array, bound: Array, resolution: Array, guess: Array
     ) -> tuple[Array, Solution]:
@@ -89,8 +94,10 @@ class ContactProblem:
         Returns:
             w (n,), NaN if the problem was not solved, and the solution on the contact pairs.
 
-        Derivative: reverse mode and its derivatives, with respect to the values of the matrix and
-        the normals, r and b; the iteration itself is never differentiated.
+        Derivative: forward and reverse mode of every order, with respect to the values of the
+        matrix and the normals, r and b; see `weak_contact`. The iteration itself is never
+        differentiated. A step keeps one boolean per pair for its backward pass, and w and p only
+        if matrix or normals are differentiated.
         """
         if self.normals.count == 0:
             velocity = _solve_linear(self, rhs)
@@ -99,7 +106,12 @@ class ContactProblem:
             return velocity, Solution(bound, guess, jnp.int32(0), status, jnp.zeros((), rhs.dtype))
         fixed = Fixed(self.matrix.columns, self.normals.unknowns, self.factor, resolution, guess)
         velocity, solution = _solve(
-            self.contact_solver, self.matrix.values, self.normals.weights, rhs, bound, fixed
+            (self.contact_solver, self.weak_contact),
+            self.matrix.values,
+            self.normals.weights,
+            rhs,
+            bound,
+            fixed,
         )
         # Multiplication poisons value and gradient alike; a `where` would leave a zero gradient.
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan)
@@ -167,17 +179,19 @@ def solve_on_cone(
     return solution[:n], solution[n:]
 
 
+# Invariant: the rule is linear in the tangents (but for CriticalCone), and the linear problem is
+# symmetric, so that JAX transposes it to the adjoint (4.40)-(4.41) with the same factor.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def solve_forward(
-    contact_solver: ContactSolver,
+def _solve(
+    options: tuple[ContactSolver, WeakContact],
     values: Array,
     weights: Array,
     rhs: Array,
     bound: Array,
     fixed: Fixed,
 ) -> tuple[Array, Solution]:
-    """Solve the VI; forward-mode derivative on the active set. See `ContactProblem.solve`."""
-    factor = fixed.factor
+    """Solve the VI; see `ContactProblem.solve`."""
+    contact_solver, factor = options[0], fixed.factor
     if isinstance(factor, IterativeFactor):
         return matrix_free.solve_contact(
             factor, contact_solver.max_steps, rhs, bound, fixed.resolution, fixed.guess
@@ -187,28 +201,88 @@ def solve_forward(
     return factor.expand(partial_sweep, solution.multiplier), solution
 
 
-@partial(solve_forward.defjvp, symbolic_zeros=True)
-def _solve_forward_jvp(contact_solver, primals, tangents):
+@partial(_solve.defjvp, symbolic_zeros=True)
+def _solve_jvp(options, primals, tangents):
+    contact_solver, weak_contact = options
     values, weights, _, bound, fixed = primals
     values_dot, weights_dot, rhs_dot, bound_dot, _ = tangents
-    w, solution = solve_forward(contact_solver, *primals)
-    normals = ContactNormals(weights, fixed.unknowns)
-    softness = contact_solver.softness(solution.multiplier, bound - normals @ w)
-    rhs_dot = _zero_if_symbolic(rhs_dot)
-    bound_dot = _zero_if_symbolic(bound_dot)
+    if isinstance(weak_contact, OnBranch):
+        direction = jax.lax.stop_gradient((_instantiate(rhs_dot), _instantiate(bound_dot)))
+        (w, solution), (w_dot, p_dot) = _solve_on_branch(contact_solver, *primals, direction)
+        return (w, solution), (w_dot, _tangent(solution, p_dot))
+    w, solution = _solve(options, *primals)
+    softness = contact_solver.softness(
+        solution.multiplier, bound - ContactNormals(weights, fixed.unknowns) @ w
+    )
+    data_dot = _linearized_data(fixed, w, solution.multiplier, tangents)
+    if softness is None and isinstance(weak_contact, CriticalCone):
+        w_dot, p_dot = _solve_critical_cone(values, weights, fixed, solution, *data_dot)
+        w_dot, p_dot = forward_only(w_dot), forward_only(p_dot)
+    else:
+        pairs = solution.active
+        if not isinstance(weak_contact, CriticalCone):
+            pairs = weak_contact.equality_set(solution)
+        w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, softness, *data_dot)
+    return (w, solution), (w_dot, _tangent(solution, p_dot))
+
+
+def _linearized_data(fixed: Fixed, w: Array, multiplier: Array, tangents) -> tuple[Array, Array]:
+    """Return dr - dD w - dN^T p, (n,), and db - dN w, (C,)."""
+    values_dot, weights_dot, rhs_dot, bound_dot, _ = tangents
+    rhs_dot, bound_dot = _instantiate(rhs_dot), _instantiate(bound_dot)
     if not isinstance(values_dot, SymbolicZero):
         rhs_dot = rhs_dot - SymmetricMatrix(values_dot, fixed.columns) @ w
     if not isinstance(weights_dot, SymbolicZero):
         normals_dot = ContactNormals(weights_dot, fixed.unknowns)
-        rhs_dot = rhs_dot - normals_dot.transposed_product(solution.multiplier, w.shape[0])
+        rhs_dot = rhs_dot - normals_dot.transposed_product(multiplier, w.shape[0])
         bound_dot = bound_dot - normals_dot @ w
-    w_dot, p_dot = solve_on_cone(
-        values, weights, fixed, solution.active, softness, rhs_dot, bound_dot
-    )
-    return (w, solution), (w_dot, _tangent(solution, p_dot))
+    return rhs_dot, bound_dot
 
 
-def _zero_if_symbolic(tangent: Any) -> Array:
+def _solve_critical_cone(
+    values: Array, weights: Array, fixed: Fixed, solution: Solution, rhs: Array, bound: Array
+) -> tuple[Array, Array]:
+    """Return dw (n,) and dp (C,) of the one-sided derivative; not linear in rhs and bound."""
+    normals = ContactNormals(weights, fixed.unknowns)
+    strong = solution.active & (solution.multiplier > 0.0)
+    weak = solution.active & ~strong
+    if isinstance(fixed.factor, IterativeFactor):
+        compliance = jnp.mean(fixed.factor.preconditioner[fixed.unknowns], axis=1)
+    else:
+        compliance = jnp.diagonal(fixed.factor.compliance)
+
+    def solve_on_set(pairs: Array) -> tuple[Array, Array, Array]:
+        w, p = solve_on_cone(values, weights, fixed, pairs, None, rhs, bound)
+        return w, p, bound - normals @ w
+
+    return critical_cone.solve(solve_on_set, strong, weak, compliance)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _solve_on_branch(contact_solver, values, weights, rhs, bound, fixed, direction):
+    """Solve the VI and its one-sided derivative along (dr, db).
+
+    Derivative: linear, on the pairs that the direction keeps in contact; the one-sided derivative
+    itself counts as constant.
+    """
+    options = (contact_solver, CriticalCone())
+    w, solution = _solve(options, values, weights, rhs, bound, fixed)
+    derivative = _solve_critical_cone(values, weights, fixed, solution, *direction)
+    return (w, solution), derivative
+
+
+@partial(_solve_on_branch.defjvp, symbolic_zeros=True)
+def _solve_on_branch_jvp(contact_solver, primals, tangents):
+    values, weights, _, _, fixed, _ = primals
+    (w, solution), derivative = _solve_on_branch(contact_solver, *primals)
+    pairs = solution.active & ((solution.multiplier > 0.0) | (derivative[1] > 0.0))
+    data_dot = _linearized_data(fixed, w, solution.multiplier, tangents[:5])
+    w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, None, *data_dot)
+    constant = jax.tree.map(jnp.zeros_like, derivative)
+    return ((w, solution), derivative), ((w_dot, _tangent(solution, p_dot)), constant)
+
+
+def _instantiate(tangent: Any) -> Array:
     if isinstance(tangent, SymbolicZero):
         return jnp.zeros(tangent.shape, tangent.dtype)
     return tangent
@@ -222,74 +296,3 @@ def _tangent(solution: Solution, multiplier_dot: Array) -> Solution:
         return np.zeros(leaf.shape, leaf.dtype if is_float else jax.dtypes.float0)
 
     return jax.tree.map(nothing, solution)._replace(multiplier=multiplier_dot)
-
-
-class Residuals(NamedTuple):
-    """What a step keeps for its backward pass; None where nothing asks for it."""
-
-    active: Array
-    """A, (C,) bool: all that the gradient by loads, states, gaps and bounds needs."""
-
-    softness: Array | None
-    """dg/dp of a relaxed contact law, (C,)."""
-
-    velocity: Array | None
-    """w, (n,), if matrix values or normals are differentiated."""
-
-    multiplier: Array | None
-    """p, (C,), if the normals are differentiated."""
-
-    values: Array
-    """Entries of D (loop-invariant, stored once)."""
-
-    weights: Array
-    """Entries of N (loop-invariant, stored once)."""
-
-    fixed: Fixed
-    """Patterns and the factor (loop-invariant, stored once)."""
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _solve(contact_solver, values, weights, rhs, bound, fixed):
-    return solve_forward(contact_solver, values, weights, rhs, bound, fixed)
-
-
-# Invariant: `_solve_bwd` solves the transpose of the linear problem that `_solve_forward_jvp`
-# solves, with the same active set. It is symmetric, so both call `solve_on_cone`.
-def _solve_fwd(contact_solver, *arguments):
-    values, weights, rhs, bound, fixed = custom_vjp_primal_tree_values(arguments)
-    is_matrix_asked, is_normals_asked = arguments[0].perturbed, arguments[1].perturbed
-    w, solution = solve_forward(contact_solver, values, weights, rhs, bound, fixed)
-    normals = ContactNormals(weights, fixed.unknowns)
-    residuals = Residuals(
-        active=solution.active,
-        softness=contact_solver.softness(solution.multiplier, bound - normals @ w),
-        velocity=w if is_matrix_asked or is_normals_asked else None,
-        multiplier=solution.multiplier if is_normals_asked else None,
-        values=values,
-        weights=weights,
-        # The guess and the resolution of a step are not needed again.
-        fixed=fixed._replace(guess=None, resolution=None),
-    )
-    return (w, solution), residuals
-
-
-def _solve_bwd(contact_solver, residuals, cotangents):
-    del contact_solver
-    w_bar, solution_bar = cotangents
-    active, softness, velocity, multiplier, values, weights, fixed = residuals
-    p_bar = _zero_if_symbolic(solution_bar.multiplier)
-    w_bar = _zero_if_symbolic(w_bar)
-    rhs_bar, bound_bar = solve_on_cone(values, weights, fixed, active, softness, w_bar, p_bar)
-    values_bar = weights_bar = None
-    if velocity is not None:
-        values_bar = -rhs_bar[None, :] * velocity[fixed.columns]
-    if velocity is not None and multiplier is not None:
-        weights_bar = -(
-            multiplier[:, None] * rhs_bar[fixed.unknowns]
-            + bound_bar[:, None] * velocity[fixed.unknowns]
-        )
-    return values_bar, weights_bar, rhs_bar, bound_bar, None
-
-
-_solve.defvjp(_solve_fwd, _solve_bwd, symbolic_zeros=True)

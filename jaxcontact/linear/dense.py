@@ -61,8 +61,7 @@ class Dense:
             coordinates: not used.
         """
         n = matrix.size
-        rows = jnp.broadcast_to(jnp.arange(n, dtype=jnp.int32)[None, :], matrix.columns.shape)
-        dense = jnp.zeros((n, n), matrix.values.dtype).at[rows, matrix.columns].add(matrix.values)
+        dense = matrix.to_dense()
         # Jacobi scaling first: it makes the inverse of a badly scaled matrix accurate.
         scale = 1.0 / jnp.sqrt(jnp.diagonal(dense))
         identity = jnp.eye(n, dtype=dense.dtype)

@@ -42,7 +42,10 @@ class FallingBar:
     gap + displacement(0, t). On a wave front x = r velocity and strain take their values for x > r.
 
     Derivative: with respect to the fields up to next_impact(); beyond it NaN, because a change of
-    a field destroys the periodicity. The defaults are periodic with p from 300 to 500 Pa and back.
+    a field destroys the periodicity. One such time in an array makes the reverse-mode derivative
+    NaN as a whole: differentiate at valid times only.
+
+    The defaults are periodic with p from 300 to 500 Pa and back.
     """
 
     young: Number = 900.0
