@@ -5,49 +5,129 @@ space dimension, i j components, n unknowns, C contact pairs, T time steps.
 """
 
 from jaxcontact import meshes, reference, scenes
-from jaxcontact.contact import ProjectedGaussSeidel, SemismoothNewton, Status
+from jaxcontact.contact import (
+    AlongDirection,
+    CriticalCone,
+    Inactive,
+    ProjectedGaussSeidel,
+    RelaxedContact,
+    SemismoothNewton,
+    Status,
+    Strong,
+    with_contact,
+)
 from jaxcontact.cost import TrackingCost
+from jaxcontact.derivative import (
+    DerivativeReport,
+    GradientCheck,
+    check_gradient,
+    derivative_report,
+    directional_derivative,
+)
 from jaxcontact.energy import Energy, energy
 from jaxcontact.inner_product import l2_value_and_grad
 from jaxcontact.io import read_mesh
-from jaxcontact.linear import ConjugateGradient, Dense
+from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.material import KelvinVoigt
 from jaxcontact.mesh import Mesh
 from jaxcontact.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.optimize import (
+    LBFGS,
+    Actuator,
+    History,
+    Homotopy,
+    NewtonCG,
+    Optax,
+    Result,
+    Stationarity,
+    SteepestDescent,
+    WeakWolfe,
+    actuator,
+    boundary_actuator,
+    load_result,
+    optimize,
+    stationarity,
+)
+from jaxcontact.pressure import contact_pressure
+from jaxcontact.reduction import reduce
 from jaxcontact.scene import Scene
-from jaxcontact.schemes import ContactImplicit
+from jaxcontact.schemes import (
+    BackwardEuler,
+    ContactImplicit,
+    ContactStabilized,
+    RedistributedMass,
+    Trapezoidal,
+)
 from jaxcontact.simulate import SolveError, simulate
+from jaxcontact.static import StaticContact, solve_static
 from jaxcontact.stepper import Stepper, prepare
 from jaxcontact.system import System, discretize
+from jaxcontact.time_loop import Checkpoint
 from jaxcontact.trajectory import State, Trajectory
 
 __all__ = [
+    "LBFGS",
+    "Actuator",
+    "AlongDirection",
+    "BackwardEuler",
     "Ball",
+    "Checkpoint",
     "ConjugateGradient",
     "ContactImplicit",
+    "ContactStabilized",
+    "CriticalCone",
     "Dense",
+    "DerivativeReport",
     "Energy",
+    "GradientCheck",
     "HalfSpace",
+    "History",
+    "Homotopy",
+    "Inactive",
     "KelvinVoigt",
     "Mesh",
+    "NestedDissection",
+    "NewtonCG",
+    "Optax",
     "ProjectedGaussSeidel",
+    "RedistributedMass",
+    "RelaxedContact",
+    "Result",
     "Scene",
     "SemismoothNewton",
     "SignedDistance",
     "SolveError",
     "State",
+    "StaticContact",
+    "Stationarity",
     "Status",
+    "SteepestDescent",
     "Stepper",
+    "Strong",
     "System",
     "TrackingCost",
     "Trajectory",
+    "Trapezoidal",
+    "WeakWolfe",
+    "actuator",
+    "boundary_actuator",
+    "check_gradient",
+    "contact_pressure",
+    "derivative_report",
+    "directional_derivative",
     "discretize",
     "energy",
     "l2_value_and_grad",
+    "load_result",
     "meshes",
+    "optimize",
     "prepare",
     "read_mesh",
+    "reduce",
     "reference",
     "scenes",
     "simulate",
+    "solve_static",
+    "stationarity",
+    "with_contact",
 ]

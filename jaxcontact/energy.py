@@ -2,7 +2,7 @@
 
 With E = 1/2 v.Mv + 1/2 y.Ay, each step of a scheme satisfies an identity
 
-    E' - E = work - viscous loss - impact loss        (to rounding)
+    E' - E = work - viscous loss - impact loss - numerical loss        (to rounding)
 
 with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2.
 """
@@ -39,6 +39,10 @@ class Energy:
 
     impact_loss: Array
     """Energy taken by the contact in each step, (T,) [J]."""
+
+    numerical_loss: Array
+    """Energy taken by the time discretisation in each step, (T,) [J]; zero for the schemes that
+    are trapezoidal without contact."""
 
     residual: Array
     """What the ledger misses in each step, (T,) [J]; rounding only."""
@@ -87,5 +91,14 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     new = jax.tree.map(lambda record: record[1:], states)
     flows = jax.lax.map(lambda step: flow(*step), (old, new, control))
     change = jnp.diff(kinetic + elastic)
-    residual = change - (flows.work - flows.viscous_loss - flows.impact_loss)
-    return Energy(kinetic, elastic, flows.work, flows.viscous_loss, flows.impact_loss, residual)
+    numerical_loss = jnp.asarray(flows.numerical_loss, change.dtype)
+    loss = flows.viscous_loss + flows.impact_loss + numerical_loss
+    return Energy(
+        kinetic=kinetic,
+        elastic=elastic,
+        work=flows.work,
+        viscous_loss=flows.viscous_loss,
+        impact_loss=flows.impact_loss,
+        numerical_loss=numerical_loss,
+        residual=change - (flows.work - loss),
+    )

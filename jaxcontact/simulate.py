@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +12,17 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import Status
+from jaxcontact.contact import AlongDirection, Status, WeakContact
+from jaxcontact.contact.branch import (
+    along_direction,
+    float_leaves,
+    tangent_of,
+    with_weak_contact,
+)
+from jaxcontact.contact.probe import at_step
 from jaxcontact.schemes import StepState
 from jaxcontact.stepper import Stepper
+from jaxcontact.system import System
 from jaxcontact.time_loop import Checkpoint, scan_steps
 from jaxcontact.trajectory import State, Trajectory
 
@@ -29,6 +39,7 @@ def simulate(
     initial: State | None = None,
     save_every: int = 1,
     checkpoint: Checkpoint | None = None,
+    weak_contact: WeakContact | AlongDirection | None = None,
 ) -> Trajectory:
     """Simulate the motion of the body.
 
@@ -45,6 +56,9 @@ def simulate(
             velocity, gap and time then have T/k + 1 levels; contact records keep all T steps.
         checkpoint: `Checkpoint(segments)` lets the backward pass recompute the steps of a segment
             instead of storing them; same gradient to rounding, about one more forward run.
+        weak_contact: what the derivative means where gap and impulse of a pair are both zero:
+            `Strong()` (default, Algorithm 1), `Inactive()`, `AlongDirection(control)`, or
+            `CriticalCone()`, the exact one-sided derivative, in forward mode.
 
     Returns:
         The trajectory of T steps.
@@ -55,8 +69,8 @@ def simulate(
         SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
             the trajectory is NaN from that step on instead.
 
-    Derivative: reverse mode of every order by control, initial state and every value of the
-    stepper; at weak contact the one of Algorithm 1 (the whole active set is strong).
+    Derivative: forward and reverse mode of every order by control, initial state and every value
+    of the stepper; at weak contact the one that `weak_contact` names.
     """
     steps = _check_steps(stepper, control, steps)
     if save_every < 1 or steps % save_every:
@@ -64,10 +78,33 @@ def simulate(
             f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
         )
     initial = _check_initial(stepper, initial)
-    trajectory = _run(stepper, control, initial, steps, save_every, checkpoint)
+    trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
-        _raise_if_failed(trajectory)
+        raise_if_failed(trajectory)
     return trajectory
+
+
+class StepShift(NamedTuple):
+    """A perturbation of the data of every step; zero, to be differentiated by."""
+
+    load: Array
+    """Added to the load, (T, n) [N]."""
+
+    gap: Array
+    """Added to the gap psi in the contact problem of the step, (T, C) [m]."""
+
+
+def simulate_shifted(
+    stepper: Stepper,
+    control: Array | None,
+    initial: State | None,
+    shift: StepShift,
+    weak_contact: WeakContact | AlongDirection,
+) -> Trajectory:
+    """Simulate with perturbed loads and gaps: their derivative are the adjoint states."""
+    initial = _check_initial(stepper, initial)
+    steps = shift.load.shape[0]
+    return _run(stepper, control, initial, weak_contact, steps, 1, None, shift)
 
 
 @partial(jax.jit, static_argnames=("steps", "save_every", "checkpoint"))
@@ -75,11 +112,16 @@ def _run(
     stepper: Stepper,
     control: Array | None,
     initial: State,
+    weak_contact: Any,
     steps: int,
     save_every: int,
     checkpoint: Checkpoint | None,
+    shift: StepShift | None = None,
 ) -> Trajectory:
     system, dt = stepper.system, stepper.dt
+    operators = stepper.operators
+    if weak_contact is not None:
+        operators = with_weak_contact(operators, weak_contact)
     start = StepState(
         displacement=system.restrict(initial.displacement),
         velocity=system.restrict(initial.velocity),
@@ -88,14 +130,29 @@ def _run(
         memory=stepper.scheme.memory(system),
     )
 
-    def advance(state: StepState, force: Array | None):
+    def advance(state: StepState, inputs: tuple[Array | None, Array, StepShift | None]):
+        force, step, shift = inputs
+        now = system if shift is None else replace(system, gap=system.gap + shift.gap)
         load = system.load if force is None else system.load + system.control_load(force)
-        state, info = stepper.scheme.step(system, stepper.operators, dt, state, load)
+        load = load if shift is None else load + shift.load
+        state, info = stepper.scheme.step(now, at_step(operators, step), dt, state, load)
         return state, (state.impulse, state.active, info)
 
-    states, (impulse, active, info) = scan_steps(
-        advance, start, control, steps, save_every, checkpoint
-    )
+    inputs = (control, jnp.arange(steps), shift)
+    if isinstance(weak_contact, AlongDirection):
+        start_dot, control_dot = _direction(system, start, control, weak_contact)
+        (states, _), (impulse, active, info) = scan_steps(
+            along_direction(advance),
+            (start, start_dot),
+            (inputs, control_dot),
+            steps,
+            save_every,
+            checkpoint,
+        )
+    else:
+        states, (impulse, active, info) = scan_steps(
+            advance, start, inputs, steps, save_every, checkpoint
+        )
 
     def with_start(first: Array, rest: Array) -> Array:
         return jnp.concatenate([first[None], rest])
@@ -113,6 +170,24 @@ def _run(
         status=info.status,
         residual=info.residual,
     )
+
+
+def _direction(
+    system: System, start: StepState, control: Array | None, along: AlongDirection
+) -> tuple[list, Array | None]:
+    """Return the tangents of the start and of the control that decide about weak contact."""
+    start_dot = tangent_of(start, None)
+    if along.initial is not None:
+        start_dot = start_dot._replace(
+            displacement=system.restrict(along.initial.displacement),
+            velocity=system.restrict(along.initial.velocity),
+        )
+    control_dot = along.control
+    if control_dot is not None and control is None:
+        raise ValueError("AlongDirection(control) needs a control; give a control of zeros")
+    if control_dot is None and control is not None:
+        control_dot = jnp.zeros_like(control)
+    return jax.lax.stop_gradient((float_leaves(start, start_dot), control_dot))
 
 
 def _check_steps(stepper: Stepper, control: Array | None, steps: int | None) -> int:
@@ -200,7 +275,8 @@ def _check_penetration(system, displacement: Array) -> None:
         )
 
 
-def _raise_if_failed(trajectory: Trajectory) -> None:
+def raise_if_failed(trajectory: Trajectory) -> None:
+    """Raise a `SolveError` if a step of a concrete trajectory was not solved."""
     status = np.asarray(trajectory.status)
     failed = np.flatnonzero(status > Status.FALLBACK)
     if not failed.size:

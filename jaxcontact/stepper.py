@@ -12,7 +12,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton
-from jaxcontact.linear import Dense, LinearSolver
+from jaxcontact.linear import LinearSolver, check_memory, choose_linear_solver
 from jaxcontact.schemes import ContactImplicit, Scheme
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
@@ -38,7 +38,7 @@ class Stepper:
     linear_solver: LinearSolver = field(metadata={"static": True})
     """How the matrix was factorised."""
 
-    contact_solver: ContactSolver = field(metadata={"static": True})
+    contact_solver: ContactSolver
     """How the contact problem of a step is solved."""
 
     def __repr__(self) -> str:
@@ -75,11 +75,13 @@ def prepare(
 
     Raises:
         ValueError: if dt is not positive, an option is a class instead of an object, the patterns
-            are traced, or a matrix is not positive definite.
+            are traced, a factor would not fit in memory, or a matrix is not positive definite.
     """
     scheme = ContactImplicit() if scheme is None else scheme
     contact_solver = SemismoothNewton() if contact_solver is None else contact_solver
-    linear_solver = Dense() if linear_solver is None else linear_solver
+    shape = (system.size, system.dimension, system.dtype.itemsize)
+    if linear_solver is None:
+        linear_solver = choose_linear_solver(*shape, is_dense=system.basis is not None)
     for name, option in (
         ("scheme", scheme),
         ("linear_solver", linear_solver),
@@ -94,6 +96,7 @@ def prepare(
             "the sparsity pattern of the system is traced; call prepare outside jax.jit, or build "
             "mesh and scene inside the transformed function so that only values are traced"
         )
+    check_memory(linear_solver, *shape)
     dt = jnp.asarray(dt, system.dtype)
     coordinates = _coordinates(system)
 
@@ -112,8 +115,8 @@ def prepare(
 
 
 def _coordinates(system: System) -> np.ndarray | None:
-    """Return the positions of the unknowns, (n, d), if they are concrete."""
-    if isinstance(system.points, Tracer):
+    """Return the positions of the unknowns, (n, d), if they are concrete and have any."""
+    if isinstance(system.points, Tracer) or system.basis is not None:
         return None
     return np.repeat(np.asarray(system.points)[system.free_nodes], system.dimension, axis=0)
 

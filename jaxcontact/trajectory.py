@@ -53,6 +53,22 @@ class Trajectory:
     """KKT residual of each step relative to the largest violation of its free motion, (T,)."""
 
     @property
+    def strong(self) -> Array:
+        """Pairs in strong contact at the end of the step, (T, C) bool: closed under an impulse."""
+        return self.active & (self.contact_impulse > 0.0)
+
+    @property
+    def weak(self) -> Array:
+        """Pairs in weak contact at the end of the step, (T, C) bool: closed without an impulse.
+
+        There the motion has one-sided derivatives only. Gap and impulse count as zero below the
+        rounding of the step's contact problem (`contact.complementarity.tolerance`); the impulse
+        then is exactly zero. `derivative_report` lists what is nearly weak. The scheme
+        `Trapezoidal` records an impulse averaged over two times, which is not judged right here.
+        """
+        return self.active & ~(self.contact_impulse > 0.0)
+
+    @property
     def final(self) -> State:
         """The state after the last step."""
         return State(self.displacement[-1], self.velocity[-1])

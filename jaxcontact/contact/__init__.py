@@ -3,13 +3,30 @@
 from jaxcontact.contact.complementarity import ContactSolver, Solution, Status
 from jaxcontact.contact.gauss_seidel import ProjectedGaussSeidel
 from jaxcontact.contact.newton import SemismoothNewton
+from jaxcontact.contact.relaxed import RelaxedContact, with_contact
 from jaxcontact.contact.vi import ContactProblem
+from jaxcontact.contact.weak import (
+    AlongDirection,
+    CriticalCone,
+    Inactive,
+    OnBranch,
+    Strong,
+    WeakContact,
+)
 
 __all__ = [
+    "AlongDirection",
     "ContactProblem",
     "ContactSolver",
+    "CriticalCone",
+    "Inactive",
+    "OnBranch",
     "ProjectedGaussSeidel",
+    "RelaxedContact",
     "SemismoothNewton",
     "Solution",
     "Status",
+    "Strong",
+    "WeakContact",
+    "with_contact",
 ]

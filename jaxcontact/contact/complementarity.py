@@ -36,10 +36,10 @@ class Solution(NamedTuple):
     """The solution of the complementarity problem of C contact pairs."""
 
     multiplier: Array
-    """p >= 0, (C,) [impulse]."""
+    """p >= 0, (C,) [impulse]; exactly zero if W_ii p_i is within the tolerance of the residual."""
 
     active: Array
-    """g = 0 up to rounding, (C,) bool: strong and weak contact together."""
+    """g = 0 up to rounding, (C,) bool: strong contact (p > 0) and weak contact (p = 0)."""
 
     iterations: Array
     """Number of active sets (Newton) or sweeps (Gauss-Seidel), int32."""
@@ -52,7 +52,7 @@ class Solution(NamedTuple):
 
 
 class ContactSolver(Protocol):
-    """An option object: static, hashable, without arrays."""
+    """An option object: a pytree; `jax.tree_util.register_static` if it holds no array."""
 
     def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
         """Solve the complementarity problem.
@@ -123,7 +123,10 @@ def finish(
     status = jnp.where(is_fallback, Status.FALLBACK, Status.CONVERGED)
     status = jnp.where(is_solved, status, Status.NOT_CONVERGED)
     status = jnp.where(is_finite, status, Status.NON_FINITE)
-    active = (multiplier > 0.0) | (g <= goal)
+    # Below the tolerance a multiplier is rounding: exactly zero marks weak contact.
+    is_pressed = jnp.diagonal(compliance) * multiplier > goal
+    multiplier = jnp.where(is_pressed | ~is_finite, multiplier, 0.0)
+    active = is_pressed | (g <= goal)
     relative_tolerance = RELATIVE_TOLERANCE[str(offset.dtype)]
     tiny = jnp.finfo(offset.dtype).tiny
     relative = relative_tolerance * jnp.max(error / jnp.maximum(goal, tiny))

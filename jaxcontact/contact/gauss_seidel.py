@@ -46,6 +46,7 @@ def iterate(
     return jax.lax.while_loop(is_unfinished, advance, (multiplier, jnp.int32(0)))
 
 
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class ProjectedGaussSeidel:
     """Projected Gauss-Seidel, to the same residual as `SemismoothNewton`."""

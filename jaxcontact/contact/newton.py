@@ -18,6 +18,7 @@ from jaxcontact.contact import complementarity, gauss_seidel
 from jaxcontact.contact.complementarity import Solution, separation, solve_on_set
 
 
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class SemismoothNewton:
     """Primal-dual active set method, warm-started with the active set of the last step."""

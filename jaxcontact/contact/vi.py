@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,32 +32,12 @@ from jaxcontact.contact.complementarity import (
     ContactSolver,
     Solution,
     Status,
-    solve_on_set,
 )
 from jaxcontact.contact.forward_only import forward_only
+from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.weak import CriticalCone, OnBranch, Strong, WeakContact
-from jaxcontact.linear import Factor
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
-
-
-class Fixed(NamedTuple):
-    """What a step uses and never differentiates."""
-
-    columns: Array | np.ndarray | None
-    """Sparsity of D, (width, n) int32; None is dense."""
-
-    unknowns: Array | np.ndarray
-    """Sparsity of N, (C, k) int32."""
-
-    factor: Factor
-    """Factor of D; the derivative by D enters through the values of the matrix instead."""
-
-    resolution: Array
-    """Rounding error of b, (C,)."""
-
-    guess: Array
-    """Active set to start from, (C,) bool."""
 
 
 @jax.tree_util.register_dataclass
@@ -74,7 +54,7 @@ class ContactProblem:
     factor: Any
     """Factor of D, see `linear.Factor`."""
 
-    contact_solver: ContactSolver = field(metadata={"static": True})
+    contact_solver: ContactSolver
     """How the condensed problem is solved."""
 
     weak_contact: WeakContact = field(default=Strong(), metadata={"static": True})
@@ -104,9 +84,16 @@ class ContactProblem:
             is_finite = jnp.all(jnp.isfinite(velocity))
             status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
             return velocity, Solution(bound, guess, jnp.int32(0), status, jnp.zeros((), rhs.dtype))
-        fixed = Fixed(self.matrix.columns, self.normals.unknowns, self.factor, resolution, guess)
+        fixed = Fixed(
+            self.matrix.columns,
+            self.normals.unknowns,
+            self.factor,
+            resolution,
+            guess,
+            self.contact_solver,
+        )
         velocity, solution = _solve(
-            (self.contact_solver, self.weak_contact),
+            self.weak_contact,
             self.matrix.values,
             self.normals.weights,
             rhs,
@@ -126,64 +113,11 @@ def _solve_linear(problem: ContactProblem, rhs: Array) -> Array:
     )
 
 
-def solve_on_cone(
-    values: Array,
-    weights: Array,
-    fixed: Fixed,
-    active: Array,
-    softness: Array | None,
-    rhs: Array,
-    bound: Array,
-) -> tuple[Array, Array]:
-    """Solve the saddle-point problem on a fixed active set; symmetric, hence its own transpose.
-
-    Args:
-        values: entries of D, (width, n).
-        weights: entries of N, (C, k).
-        fixed: patterns and the factor.
-        active: A, (C,) bool.
-        softness: s, (C,) or None for zero.
-        rhs: dr, (n,).
-        bound: db, (C,); read on A only.
-
-    Returns:
-        dw (n,) and dp (C,), zero outside A.
-
-    Derivative: of every order, with respect to values, weights, softness, rhs and bound.
-    """
-    matrix = SymmetricMatrix(values, fixed.columns)
-    normals = ContactNormals(weights, fixed.unknowns)
-
-    n = rhs.shape[0]
-
-    # One vector (w, p): custom_linear_solve fails where only one of two parts has a tangent.
-    def saddle_point(unknowns):
-        w, p = unknowns[:n], unknowns[n:]
-        p_active = jnp.where(active, p, 0.0)
-        stretch = normals @ w if softness is None else normals @ w - softness * p
-        balance = matrix @ w + normals.transposed_product(p_active, n)
-        return jnp.concatenate([balance, jnp.where(active, stretch, p)])
-
-    factor, frozen_softness = jax.lax.stop_gradient((fixed.factor, softness))
-
-    def solve(_, data):
-        r, b = data[:n], data[n:]
-        if isinstance(factor, IterativeFactor):
-            return jnp.concatenate(factor.solve_on_set(active, r, b))
-        partial_sweep, free = factor.condense(r)
-        p = solve_on_set(factor.compliance, active, frozen_softness, jnp.where(active, free - b, b))
-        return jnp.concatenate([factor.expand(partial_sweep, jnp.where(active, p, 0.0)), p])
-
-    data = jnp.concatenate([rhs, jnp.where(active, bound, 0.0)])
-    solution = jax.lax.custom_linear_solve(saddle_point, data, solve, symmetric=True)
-    return solution[:n], solution[n:]
-
-
 # Invariant: the rule is linear in the tangents (but for CriticalCone), and the linear problem is
 # symmetric, so that JAX transposes it to the adjoint (4.40)-(4.41) with the same factor.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(
-    options: tuple[ContactSolver, WeakContact],
+    weak_contact: WeakContact,
     values: Array,
     weights: Array,
     rhs: Array,
@@ -191,8 +125,14 @@ def _solve(
     fixed: Fixed,
 ) -> tuple[Array, Solution]:
     """Solve the VI; see `ContactProblem.solve`."""
-    contact_solver, factor = options[0], fixed.factor
+    del weak_contact
+    contact_solver, factor = fixed.contact_solver, fixed.factor
     if isinstance(factor, IterativeFactor):
+        if not _is_exact(contact_solver, bound):
+            raise ValueError(
+                f"ConjugateGradient cannot solve {type(contact_solver).__name__}; prepare with "
+                "another linear_solver, such as jc.NestedDissection()"
+            )
         return matrix_free.solve_contact(
             factor, contact_solver.max_steps, rhs, bound, fixed.resolution, fixed.guess
         )
@@ -202,16 +142,15 @@ def _solve(
 
 
 @partial(_solve.defjvp, symbolic_zeros=True)
-def _solve_jvp(options, primals, tangents):
-    contact_solver, weak_contact = options
+def _solve_jvp(weak_contact, primals, tangents):
     values, weights, _, bound, fixed = primals
-    values_dot, weights_dot, rhs_dot, bound_dot, _ = tangents
-    if isinstance(weak_contact, OnBranch):
-        direction = jax.lax.stop_gradient((_instantiate(rhs_dot), _instantiate(bound_dot)))
-        (w, solution), (w_dot, p_dot) = _solve_on_branch(contact_solver, *primals, direction)
+    if isinstance(weak_contact, OnBranch) and _is_exact(fixed.contact_solver, bound):
+        # AlongDirection moves loads and states, neither matrices nor normals.
+        direction = jax.lax.stop_gradient((_instantiate(tangents[2]), _instantiate(tangents[3])))
+        (w, solution), (w_dot, p_dot) = _solve_on_branch(*primals, direction)
         return (w, solution), (w_dot, _tangent(solution, p_dot))
-    w, solution = _solve(options, *primals)
-    softness = contact_solver.softness(
+    w, solution = _solve(weak_contact, *primals)
+    softness = fixed.contact_solver.softness(
         solution.multiplier, bound - ContactNormals(weights, fixed.unknowns) @ w
     )
     data_dot = _linearized_data(fixed, w, solution.multiplier, tangents)
@@ -220,7 +159,11 @@ def _solve_jvp(options, primals, tangents):
         w_dot, p_dot = forward_only(w_dot), forward_only(p_dot)
     else:
         pairs = solution.active
-        if not isinstance(weak_contact, CriticalCone):
+        if softness is not None:
+            # Infinitely soft pairs are open; a product with infinity would be NaN.
+            pairs = jnp.isfinite(softness)
+            softness = jnp.where(pairs, softness, 0.0)
+        elif not isinstance(weak_contact, CriticalCone):
             pairs = weak_contact.equality_set(solution)
         w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, softness, *data_dot)
     return (w, solution), (w_dot, _tangent(solution, p_dot))
@@ -258,28 +201,32 @@ def _solve_critical_cone(
     return critical_cone.solve(solve_on_set, strong, weak, compliance)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _solve_on_branch(contact_solver, values, weights, rhs, bound, fixed, direction):
+@jax.custom_jvp
+def _solve_on_branch(values, weights, rhs, bound, fixed, direction):
     """Solve the VI and its one-sided derivative along (dr, db).
 
     Derivative: linear, on the pairs that the direction keeps in contact; the one-sided derivative
     itself counts as constant.
     """
-    options = (contact_solver, CriticalCone())
-    w, solution = _solve(options, values, weights, rhs, bound, fixed)
+    w, solution = _solve(CriticalCone(), values, weights, rhs, bound, fixed)
     derivative = _solve_critical_cone(values, weights, fixed, solution, *direction)
     return (w, solution), derivative
 
 
 @partial(_solve_on_branch.defjvp, symbolic_zeros=True)
-def _solve_on_branch_jvp(contact_solver, primals, tangents):
+def _solve_on_branch_jvp(primals, tangents):
     values, weights, _, _, fixed, _ = primals
-    (w, solution), derivative = _solve_on_branch(contact_solver, *primals)
+    (w, solution), derivative = _solve_on_branch(*primals)
     pairs = solution.active & ((solution.multiplier > 0.0) | (derivative[1] > 0.0))
     data_dot = _linearized_data(fixed, w, solution.multiplier, tangents[:5])
     w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, None, *data_dot)
     constant = jax.tree.map(jnp.zeros_like, derivative)
     return ((w, solution), derivative), ((w_dot, _tangent(solution, p_dot)), constant)
+
+
+def _is_exact(contact_solver: ContactSolver, pairs: Array) -> bool:
+    """Return whether the contact law is rigid."""
+    return contact_solver.softness(pairs, pairs) is None
 
 
 def _instantiate(tangent: Any) -> Array:

@@ -4,8 +4,18 @@ A solver is an option object with one method, `factorize`; the factor answers wh
 of the matrix D: solve with it, and solve a contact problem on it in one sweep (MATH.md 2).
 """
 
+from jaxcontact.linear.choice import check_memory, choose_linear_solver
 from jaxcontact.linear.conjugate_gradient import ConjugateGradient
 from jaxcontact.linear.dense import Dense
 from jaxcontact.linear.interface import Factor, LinearSolver
+from jaxcontact.linear.nested_dissection import NestedDissection
 
-__all__ = ["ConjugateGradient", "Dense", "Factor", "LinearSolver"]
+__all__ = [
+    "ConjugateGradient",
+    "Dense",
+    "Factor",
+    "LinearSolver",
+    "NestedDissection",
+    "check_memory",
+    "choose_linear_solver",
+]

@@ -1,12 +1,13 @@
 """Index maps of a multifrontal factorisation (host, NumPy).
 
-The elimination runs through stages. At each stage the unknowns eliminated together form *fronts*, each
-with s own unknowns and b boundary unknowns (later unknowns coupled to them), and fronts of similar size
-form a batch, padded to one size. From the stages this file derives where everything lies: unknowns in
-fronts, contributions of the children in their parents, and matrix entries in front matrices.
+The elimination runs through stages. At each stage the unknowns eliminated together form *fronts*,
+each with s own unknowns and b boundary unknowns (later unknowns coupled to them), and fronts of
+similar size form a batch, padded to one size. From the stages this file derives where everything
+lies: unknowns in fronts, contributions of the children in their parents, and matrix entries in
+front matrices.
 
-A vector of updates (all boundary values of one stage) and the Schur complements of one stage are stored
-one after the other with one zero behind them, the place of every contribution that does not exist.
+The updates (boundary values of all fronts) of one stage are stored one after the other with one
+zero behind them, the place of every contribution that does not exist; so are its Schur complements.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class BatchPlan(NamedTuple):
     child_stride: np.ndarray
     """Row length of that Schur complement, (J, F)."""
     child_position: np.ndarray
-    """Position in the child's boundary of each position, (J, F, s + b); -1 if the child lacks it."""
+    """Position of each position in the child's boundary, (J, F, s + b); -1 if it is not there."""
 
 
 class Stage(NamedTuple):

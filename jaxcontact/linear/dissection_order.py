@@ -1,12 +1,12 @@
 """Nested dissection of a mesh graph by coordinate bisection (host, NumPy).
 
-Every part of the mesh is cut in two halves of equal size across one coordinate axis; the smallest set
-of nodes that meets every cut edge (a minimum vertex cover, by König's theorem from a maximum matching)
-separates the halves. All parts of one depth are cut at once, so the work is a few sorts and one matching
-per depth and axis.
+Every part of the mesh is cut in two halves of equal size across one coordinate axis; the smallest
+set of nodes that meets every cut edge (a minimum vertex cover, by König's theorem from a maximum
+matching) separates the halves. All parts of one depth are cut at once, so the work is a few sorts
+and one matching per depth and axis.
 
-Source: A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973);
-J. Liu, A graph partitioning algorithm by node separators, ACM Trans. Math. Softw. 15 (1989).
+Source: A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10
+(1973); J. Liu, A graph partitioning algorithm by node separators, ACM TOMS 15 (1989).
 """
 
 from __future__ import annotations
@@ -91,7 +91,11 @@ def _adjacency(edges, n_nodes):
 
 
 def _bisect(edges, coordinates, sizes, part, active):
-    """Cut every part across the axis with the smallest separator; (N,) side 0 or 1, (N,) is_separator."""
+    """Cut every part across the axis with the smallest separator.
+
+    Returns:
+        side of each node, 0 or 1, (N,); True for the nodes of the separators, (N,).
+    """
     side = np.zeros(len(sizes), np.int64)
     is_separator = np.zeros(len(sizes), bool)
     smallest = np.full(part[active].max() + 1, np.inf)

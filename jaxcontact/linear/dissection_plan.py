@@ -2,25 +2,31 @@
 
 Depths of the separator tree are merged into stages; the nodes that one part eliminates at one stage
 are a *front* with s own unknowns and b boundary unknowns (later unknowns coupled to it). A solve
-streams s (s + 2 b) numbers per front. Fronts of a stage are padded to one size and become one batched
-product, or a few where sizes differ. Stages and batches minimise
+streams s (s + 2 b) numbers per front. Fronts of a stage are padded to one size and become one
+batched product, or a few where sizes differ. Stages and batches minimise
 
-    numbers streamed + LAUNCH_COST * number of batches.
+    numbers streamed + batch cost * number of batches.
 
 Source: J. Liu, The multifrontal method for sparse matrix solution, SIAM Review 34 (1992).
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from typing import NamedTuple
 
 import numpy as np
+from jax.core import Tracer
 
 from jaxcontact.linear.dissection_layout import BatchPlan, Unknowns, lay_out, make_stage, places
 from jaxcontact.linear.dissection_order import dissect, hop_coordinates
 
 LAUNCH_COST = 20_000
 """Time of the kernels of one batch, in numbers streamed in that time (about 3 us on a CPU)."""
+
+COMPILE_COST = 0.01
+"""Share of the streamed numbers that a batch must save to be worth its compilation."""
 
 
 class DissectionPlan(NamedTuple):
@@ -46,6 +52,43 @@ def estimate_memory(plan: DissectionPlan, itemsize: int) -> int:
         for batch in stage
     )
     return plan.n_stored * itemsize + maps + plan.places.nbytes
+
+
+_PLANS: OrderedDict[bytes, DissectionPlan] = OrderedDict()
+_MAX_PLANS = 8
+
+
+def plan_for(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
+    """Return the plan of a sparsity pattern, from the last few plans if it is among them.
+
+    Args:
+        columns: (width, n) columns of the matrix, padded by the own row.
+        unknowns: (C, k) contact unknowns, eliminated last.
+        coordinates: (n, d) positions of the unknowns, or None.
+        leaf_size: largest number of unknowns in a leaf of the separator tree.
+
+    Raises:
+        ValueError: if one of the arrays is traced.
+    """
+    if any(isinstance(x, Tracer) for x in (columns, unknowns, coordinates)):
+        raise ValueError(
+            "nested dissection orders the unknowns on the host, but the sparsity pattern or the "
+            "coordinates are traced; build the system outside jit and pass the values in"
+        )
+    columns, unknowns = np.asarray(columns, np.int32), np.asarray(unknowns, np.int32)
+    key = hashlib.blake2b(repr((columns.shape, unknowns.shape, leaf_size)).encode())
+    key.update(columns.tobytes())
+    key.update(unknowns.tobytes())
+    if coordinates is not None:
+        coordinates = np.asarray(coordinates, float)
+        key.update(coordinates.tobytes())
+    digest = key.digest()
+    if digest not in _PLANS:
+        _PLANS[digest] = build_plan(columns, unknowns, coordinates, leaf_size)
+        while len(_PLANS) > _MAX_PLANS:
+            _PLANS.popitem(last=False)
+    _PLANS.move_to_end(digest)
+    return _PLANS[digest]
 
 
 class _Tree(NamedTuple):
@@ -90,7 +133,7 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
         parts, nodes = tree.boundary[head]
         keys, members = _unknowns_of(parts, nodes, node, sizes, where.rank)
         offset = stages[-1].n_solution if stages else 0
-        batch = _batch(own, tree.boundary_size[head])[0]
+        batch = _batch(own, tree.boundary_size[head], _batch_cost(tree))[0]
         stages.append(make_stage(own, tree.boundary_size[head], batch, keys, members, offset))
     root_places = where.local[unknowns].astype(np.int32)
     n_stored = sum(int((x.s * (x.s + x.b)).sum()) for x in stages)
@@ -146,12 +189,13 @@ def _eliminate(dissection, edges, sizes) -> _Tree:
 def _merge_depths(tree) -> list[int]:
     """Choose the stages: the first depth of each, from the root, by dynamic programming."""
     n_depths = len(tree.own_size)
+    batch_cost = _batch_cost(tree)
     best, choice = [0.0] * (n_depths + 1), [0] * (n_depths + 1)
     for head in range(n_depths - 1, -1, -1):
         own, costs = np.zeros_like(tree.own_size[head]), []
         for end in range(head + 1, n_depths + 1):
             own = own + tree.own_size[end - 1].reshape(len(own), -1).sum(1)
-            stage_cost = _batch(own, tree.boundary_size[head])[1]
+            stage_cost = _batch(own, tree.boundary_size[head], batch_cost)[1]
             costs.append(stage_cost + best[end])
             if stage_cost > 4 * min(costs):
                 break
@@ -163,7 +207,13 @@ def _merge_depths(tree) -> list[int]:
     return heads
 
 
-def _batch(own, boundary, n_cuts=12):
+def _batch_cost(tree):
+    """Cost of one more batch, in numbers streamed."""
+    sizes = zip(tree.own_size, tree.boundary_size, strict=True)
+    return LAUNCH_COST + COMPILE_COST * sum(int((s * (s + 2 * b)).sum()) for s, b in sizes)
+
+
+def _batch(own, boundary, batch_cost, n_cuts=12):
     """Split fronts into batches of similar size: batch of each front (F,), and the cost."""
     order = np.argsort(own * (own + 2 * boundary), kind="stable")
     cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
@@ -174,7 +224,7 @@ def _batch(own, boundary, n_cuts=12):
         s_max = np.maximum.accumulate(s[:j][::-1])[::-1]
         b_max = np.maximum.accumulate(b[:j][::-1])[::-1]
         count = cuts[j] - cuts[:j]
-        costs = np.array(best) + LAUNCH_COST + count * s_max * (s_max + 2.0 * b_max)
+        costs = np.array(best) + batch_cost + count * s_max * (s_max + 2.0 * b_max)
         best.append(costs.min())
         start.append(int(costs.argmin()))
     label, j = np.zeros(len(own), np.int64), len(cuts) - 1

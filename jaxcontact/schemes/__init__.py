@@ -1,6 +1,20 @@
 """Time-stepping schemes: each an option object on one factor and one contact problem per step."""
 
+from jaxcontact.schemes.backward_euler import BackwardEuler
 from jaxcontact.schemes.contact_implicit import ContactImplicit
+from jaxcontact.schemes.contact_stabilized import ContactStabilized
 from jaxcontact.schemes.interface import EnergyFlow, Scheme, StepInfo, StepState
+from jaxcontact.schemes.redistributed_mass import RedistributedMass
+from jaxcontact.schemes.trapezoidal import Trapezoidal
 
-__all__ = ["ContactImplicit", "EnergyFlow", "Scheme", "StepInfo", "StepState"]
+__all__ = [
+    "BackwardEuler",
+    "ContactImplicit",
+    "ContactStabilized",
+    "EnergyFlow",
+    "RedistributedMass",
+    "Scheme",
+    "StepInfo",
+    "StepState",
+    "Trapezoidal",
+]

@@ -19,6 +19,7 @@ from jax import Array
 
 from jaxcontact.contact import ContactProblem
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
+from jaxcontact.schemes.terms import gap_resolution, viscous_loss
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
 
@@ -53,6 +54,10 @@ class ContactImplicit:
             matrix = matrix + 0.5 * dt * system.viscosity
         return ImplicitOperators(system.mass, make_problem(matrix))
 
+    def memory(self, system: System) -> tuple[()]:
+        """Return (): displacement and velocity are all a step needs."""
+        return ()
+
     def step(
         self,
         system: System,
@@ -84,19 +89,9 @@ class ContactImplicit:
     ) -> EnergyFlow:
         """Return work tau w.f', viscous loss tau w.Bw and impact loss lam.(psi - N y)/tau."""
         increment = new.displacement - old.displacement
-        viscous_loss = jnp.zeros((), increment.dtype)
-        if system.viscosity is not None:
-            viscous_loss = jnp.dot(increment, system.viscosity @ increment) / dt
         gap = system.gap - system.normals @ old.displacement
         return EnergyFlow(
             work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss,
+            viscous_loss=viscous_loss(system, dt, increment),
             impact_loss=jnp.dot(new.impulse, gap) / dt,
         )
-
-
-def gap_resolution(system: System, y: Array) -> Array:
-    """Return the rounding error of the gap psi - N y, (C,) [m]: a smaller gap is closed."""
-    normal_displacement = jnp.abs(system.normals.weights * y[system.normals.unknowns]).sum(axis=1)
-    magnitude = jnp.abs(system.gap) + normal_displacement
-    return jax.lax.stop_gradient(4.0 * jnp.finfo(y.dtype).eps * magnitude)

@@ -27,6 +27,9 @@ class StepState(NamedTuple):
     active: Array
     """Active contact pairs of the last step, (C,) bool."""
 
+    memory: Any = ()
+    """What else the scheme hands on, see `Scheme.memory`."""
+
 
 class StepInfo(NamedTuple):
     """How the contact problems of a step were solved."""
@@ -53,6 +56,9 @@ class EnergyFlow(NamedTuple):
     impact_loss: Array
     """Energy taken by the contact (negative: contact has added energy)."""
 
+    numerical_loss: Array | float = 0.0
+    """Energy taken by the time discretisation away from contact; zero for most schemes."""
+
 
 #: Makes the contact problem of an SPD matrix with the system's contact normals.
 ProblemFactory = Callable[[SymmetricMatrix], ContactProblem]
@@ -63,6 +69,10 @@ class Scheme(Protocol):
 
     def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> Any:
         """Return the operators of the scheme, a pytree with at least `.mass`."""
+        ...
+
+    def memory(self, system: System) -> Any:
+        """Return what a step must remember beside the state, at the start; () for most schemes."""
         ...
 
     def step(

@@ -1,0 +1,98 @@
+"""The half disc pressed on a plane by a constant force, on nested meshes, against a fine run.
+
+Nodes of m rings are nodes of 2 m rings too, so displacements are compared at nodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+
+import jaxcontact as jc
+
+DURATION = 7.5e-3
+PUSH = -1e6
+GAP = 0.1
+
+
+class Reference(NamedTuple):
+    """A fine run."""
+
+    points: np.ndarray
+    times: np.ndarray
+    displacement: np.ndarray
+    """(T+1, N, 2) [m]."""
+    impulse: np.ndarray
+    """Impulse of all pairs from the start to each time level, (T+1,) [N s]."""
+    energy: float
+    gradient: float
+
+
+def prepare(rings: int, dt: float, scheme: Any, dtype: Any = jnp.float64) -> jc.Stepper:
+    """Return the stepper of the half disc of m rings under a body force."""
+    scene = dataclasses.replace(
+        jc.scenes.half_disc(h=15.0 / rings, gap=GAP), body_force=np.array([0.0, PUSH])
+    )
+    return jc.prepare(jc.discretize(scene, dtype=dtype), dt, scheme=scheme)
+
+
+def run(stepper: jc.Stepper, push: jax.Array, steps: int) -> tuple[jax.Array, jc.Trajectory]:
+    """Return mean vertical displacement over space and time, and the trajectory.
+
+    Args:
+        stepper: from `prepare`.
+        push: factor of the body force, scalar.
+        steps: number of steps.
+    """
+    system = dataclasses.replace(stepper.system, load=push * stepper.system.load)
+    trajectory = jc.simulate(dataclasses.replace(stepper, system=system), steps=steps)
+    nodal = trajectory.displacement[:, :, 1].T
+    weighted = stepper.system.nodal_mass @ nodal
+    area = jnp.sum(stepper.system.nodal_mass @ jnp.ones((system.n_nodes, 1), system.dtype))
+    middle = 0.5 * (weighted[:, 1:] + weighted[:, :-1])
+    return jnp.sum(middle) / (area * steps), trajectory
+
+
+def gradient(stepper: jc.Stepper, push: jax.Array, steps: int) -> jax.Array:
+    """Return the derivative of the mean displacement by the factor of the body force."""
+    return jax.grad(lambda p: run(stepper, p, steps)[0])(push)
+
+
+def reference(rings: int, steps: int, scheme: Any) -> Reference:
+    """Return the fine run."""
+    stepper = prepare(rings, DURATION / steps, scheme)
+    one = jnp.asarray(1.0, stepper.system.dtype)
+    trajectory = run(stepper, one, steps)[1]
+    impulse = np.asarray(trajectory.contact_impulse).sum(axis=1)
+    total = np.asarray(jc.energy(stepper, trajectory).total)
+    return Reference(
+        np.asarray(stepper.system.points),
+        np.asarray(trajectory.time),
+        np.asarray(trajectory.displacement),
+        np.concatenate([[0.0], np.cumsum(impulse)]),
+        float(total[-1]),
+        float(gradient(stepper, one, steps)),
+    )
+
+
+def errors(stepper: jc.Stepper, trajectory: jc.Trajectory, slope: float, fine: Reference) -> dict:
+    """Return the relative errors of a run against a fine one."""
+    _, nodes = scipy.spatial.cKDTree(fine.points).query(np.asarray(stepper.system.points))
+    times = np.asarray(trajectory.time, float)
+    levels = np.clip(np.searchsorted(fine.times, times - 1e-9), 0, len(fine.times) - 1)
+    exact = fine.displacement[levels][:, nodes]
+    impulse = np.asarray(trajectory.contact_impulse, float).sum(axis=1)
+    exact_impulse = np.diff(np.interp(times, fine.times, fine.impulse))
+    total = float(jc.energy(stepper, trajectory).total[-1])
+    difference = np.asarray(trajectory.displacement, float) - exact
+    return {
+        "displacement": float(np.linalg.norm(difference) / np.linalg.norm(exact)),
+        "force": float(np.abs(impulse - exact_impulse).sum() / exact_impulse.sum()),
+        "energy": abs(total / fine.energy - 1.0),
+        "gradient": abs(slope / fine.gradient - 1.0),
+    }

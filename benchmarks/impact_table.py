@@ -1,0 +1,132 @@
+"""Which scheme does what when a bar hits a wall: displacement, force, chatter and energy.
+
+P2, the free bar (`bars.free_bar`), mean over eight phases of the impact inside a step, for two
+meshes; and P1, the clamped bar, over ten impacts. Prints the figures beside those of an independent
+program. Trapezoidal: force at the end of a step, as there; its mean force is in the JSON.
+"""
+
+from __future__ import annotations
+
+import bars
+import measure
+import numpy as np
+
+import jaxcontact as jc
+
+SCHEMES = {
+    "Trapezoidal": jc.Trapezoidal(),
+    "ContactImplicit": jc.ContactImplicit(),
+    "ContactStabilized": jc.ContactStabilized(),
+    "RedistributedMass": jc.RedistributedMass(),
+    "BackwardEuler": jc.BackwardEuler(),
+}
+COLUMNS = ("eu", "ef", "osc", "E_end")
+
+#: An independent program: (scheme, Courant number) -> {n: (eu, ef, osc, E_end/E0)}.
+INDEPENDENT = {
+    ("Trapezoidal", 0.5): {200: (0.065, 1.7, 3.0, 18), 800: (0.035, 1.8, 3.7, 29)},
+    ("Trapezoidal", 1.0): {200: (0.044, 1.30, 1.5, 14), 800: (0.024, 1.33, 1.5, 29)},
+    ("Trapezoidal", 4.0): {200: (0.019, 0.62, 0.67, 0.997), 800: (0.0075, 0.57, 0.64, 0.999)},
+    ("ContactImplicit", 0.5): {
+        200: (0.0045, 0.51, 0.51, 0.9983),
+        800: (0.0019, 0.51, 0.51, 0.9996),
+    },
+    ("ContactImplicit", 1.0): {
+        200: (0.0058, 0.29, 0.29, 0.9980),
+        800: (0.0024, 0.29, 0.29, 0.9995),
+    },
+    ("ContactImplicit", 4.0): {
+        200: (0.020, 0.081, 0.072, 0.9932),
+        800: (0.0078, 0.076, 0.072, 0.9983),
+    },
+    ("ContactStabilized", 1.0): {
+        200: (0.0073, 0.0067, 0.0, 0.9970),
+        800: (0.0027, 0.0025, 0.0, 0.9993),
+    },
+    ("ContactStabilized", 4.0): {
+        200: (0.021, 0.019, 0.001, 0.9917),
+        800: (0.0080, 0.0074, 0.0, 0.9980),
+    },
+    ("RedistributedMass", 1.0): {
+        200: (0.0054, 0.0078, 0.0, 0.9993),
+        800: (0.0023, 0.0027, 0.0, 0.9998),
+    },
+    ("BackwardEuler", 1.0): {200: (0.057, 0.040, 0.0, 0.871), 800: (0.029, 0.020, 0.0, 0.935)},
+}
+#: Energy after ten impacts of P1 at Courant number one: scheme -> {n: E/E0}.
+TEN_IMPACTS = {
+    "Trapezoidal": {100: 32, 400: 131},
+    "ContactImplicit": {100: 0.985, 400: 0.997},
+    "ContactStabilized": {100: 0.968, 400: 0.995},
+    "RedistributedMass": {100: 0.986, 400: 0.996},
+    "BackwardEuler": {100: 0.06, 400: 0.41},
+}
+
+
+def one_impact(name: str, n: int, courant: float, count: int = 8) -> dict:
+    """Return the row of a scheme: means over the phases, the largest energy of all."""
+    found = bars.run(bars.free_bar(), SCHEMES[name], n, courant, count=count)
+    row = {
+        "scheme": name,
+        "courant": courant,
+        "n": n,
+        "eu": found.displacement.mean(),
+        "ef": found.end_force.mean(),
+        "osc": found.end_oscillation.mean(),
+        "E_end": found.final_energy.mean(),
+        "E_max": found.largest_energy.max(),
+        "ef_mean_force": found.force.mean(),
+        "osc_mean_force": found.oscillation.mean(),
+        "ledger": found.ledger.max(),
+    }
+    independent = INDEPENDENT.get((name, courant), {}).get(n)
+    if independent is not None:
+        row |= {f"independent_{key}": v for key, v in zip(COLUMNS, independent, strict=True)}
+    return row
+
+
+def ten_impacts(name: str, n: int) -> dict:
+    """Return the energy of a scheme after ten impacts of the clamped bar, T = 30."""
+    bar = bars.clamped_bar(periods=10.0)
+    dt = bars.time_step(bar, n, 1.0)
+    stepper = jc.prepare(bars.discretize(bar, n), dt, scheme=SCHEMES[name])
+    _, stepper, initial = bars.place(bar, stepper, 0.0)
+    trajectory = jc.simulate(stepper, steps=round(30.0 / dt), initial=initial)
+    total = np.asarray(jc.energy(stepper, trajectory).total)
+    row = {"scheme": name, "n": n, "E_end": total[-1] / total[0]}
+    return row | {"independent_E_end": TEN_IMPACTS[name].get(n)}
+
+
+def _show(row: dict) -> dict:
+    """Return a row of the printed table: figure (independent figure)."""
+    cells = {key: row[key] for key in ("scheme", "courant", "n") if key in row}
+    for key in COLUMNS:
+        if key in row:
+            independent = row.get(f"independent_{key}")
+            cells[key] = f"{row[key]:.4g}" + ("" if independent is None else f" ({independent:g})")
+    return cells
+
+
+def main(argv: list[str] | None = None) -> dict[str, list[dict]]:
+    """Run the tables."""
+    options = measure.parse(measure.parser(__doc__), argv)
+    sizes, courants, count = ([40], [1.0], 2) if options.quick else ([200, 800], [0.5, 1, 4], 8)
+    impact_sizes = [20] if options.quick else [100, 400]
+    impact = [
+        one_impact(name, n, float(courant), count)
+        for name in SCHEMES
+        for courant in courants
+        for n in sizes
+    ]
+    impacts = [ten_impacts(name, n) for name in SCHEMES for n in impact_sizes]
+    print("One impact of P2; in brackets an independent program.")
+    measure.print_table([_show(row) for row in impact])
+    print("Ten impacts of P1.")
+    measure.print_table([_show(row) for row in impacts])
+    tables = {"one_impact": impact, "ten_impacts": impacts}
+    measure.save("impact_table", tables, options.out, phases=count)
+    return tables
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""Relaxed contact: p_i g_i = kappa instead of p_i g_i = 0, a smooth model of the contact law.
+
+    g = W p + q,    p_i g_i = kappa > 0,    p, g > 0,
+
+are the optimality conditions of the strictly convex barrier problem
+
+    min  1/2 p.W p + q.p - kappa sum_i log p_i.
+
+Newton's method in the unknown x = d p - g with d = diag W, from which p and g follow such that
+p g = kappa holds exactly,
+
+    r = sqrt(x^2 + 4 d kappa),    p = (r + x) / (2 d),    g = (r - x) / 2,
+
+is never infeasible, has the matrix W + diag(g / p), and becomes the primal-dual active set method
+as kappa tends to zero. The derivative dp = -(W + diag(g / p))^-1 dq replaces the active set of
+exact contact by the weight g / p: zero on strong contact, infinite off contact, and in weak
+contact the share of the multiplier. Source: MATH.md 5; Forsgren, Gill, Wright, SIAM Review 44
+(2002) for the barrier; Chen, Harker, Kanzow, Smale for the change of unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxcontact.contact import complementarity
+from jaxcontact.contact.complementarity import (
+    ContactSolver,
+    Solution,
+    Status,
+    separation,
+    solve_on_set,
+)
+
+#: Halvings of a Newton step before it is taken anyway.
+MAX_HALVINGS = 12
+
+#: Newton steps without progress before rounding is taken to have ended the descent.
+PATIENCE = 4
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RelaxedContact:
+    """Smooth contact with the law (multiplier) x (separation velocity) = kappa.
+
+    Every pair feels every obstacle at any distance, so gradients exist everywhere, do not vanish
+    before touch, and have derivatives of every order. A pair never touches. `kappa` is a leaf: a
+    new value compiles nothing.
+
+    Of a trajectory of the contact-implicit scheme, lam_i gap_i = 2 tau kappa in every step, i.e.
+    (mean contact force) x (gap) = 2 kappa.
+
+    Derivative: forward and reverse mode of every order; kappa counts as constant.
+    """
+
+    kappa: float | Array
+    """Product of multiplier and separation velocity of every pair, scalar, positive [J]."""
+
+    max_steps: int = field(default=100, metadata={"static": True})
+    """Newton steps before a time step ends as not converged."""
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+        """Solve the relaxed problem; see `ContactSolver.solve`.
+
+        Active are the pairs that are nearer to strong contact than to separation, d p > g.
+        """
+        diagonal = jnp.diagonal(compliance)
+        kappa = jax.lax.stop_gradient(jnp.asarray(self.kappa, offset.dtype))
+        scale = jnp.sqrt(diagonal)
+
+        def residual(x: Array) -> Array:
+            p, g, _ = _pair(x, diagonal, kappa)
+            return separation(compliance, offset, p) - g
+
+        def noise(x: Array) -> Array:
+            p, g, _ = _pair(x, diagonal, kappa)
+            size = jnp.abs(compliance) @ p + jnp.abs(offset) + g
+            return jnp.finfo(x.dtype).eps * size
+
+        def merit(error: Array) -> Array:
+            return jnp.linalg.norm(error / scale)
+
+        def is_unfinished(carry):
+            _, error, goal, best, steps, patience = carry
+            del best
+            return jnp.any(jnp.abs(error) > goal) & (steps < self.max_steps) & (patience > 0)
+
+        def advance(carry):
+            x, error, _, best, steps, patience = carry
+            p, g, root = _pair(x, diagonal, kappa)
+            everywhere = jnp.ones(x.shape, bool)
+            direction = solve_on_set(compliance, everywhere, g / p, -error) * (root / p)
+
+            def is_too_long(trial):
+                t, trial_error = trial
+                is_worse = ~(merit(trial_error) <= (1.0 - 0.1 * t) * merit(error))
+                return is_worse & (t > 0.5**MAX_HALVINGS)
+
+            def shorten(trial):
+                t = 0.5 * trial[0]
+                return t, residual(x + t * direction)
+
+            full = (jnp.ones((), x.dtype), residual(x + direction))
+            t, new_error = jax.lax.while_loop(is_too_long, shorten, full)
+            x = x + t * direction
+            size = merit(new_error)
+            # Rounding ends the descent: a few steps without progress are enough.
+            patience = jnp.where(size < 0.95 * best, PATIENCE, patience - 1)
+            return x, new_error, noise(x), jnp.minimum(best, size), steps + 1, patience
+
+        multiplier = solve_on_set(compliance, guess, None, jnp.where(guess, -offset, 0.0))
+        x = diagonal * multiplier - separation(compliance, offset, multiplier)
+        error = residual(x)
+        start = (x, error, noise(x), merit(error), jnp.int32(0), jnp.int32(PATIENCE))
+        x, error, goal, _, steps, _ = jax.lax.while_loop(is_unfinished, advance, start)
+        multiplier, _, _ = _pair(x, diagonal, kappa)
+        goal = 64.0 * goal + complementarity.tolerance(offset, resolution)
+        return _finish(multiplier, x, error, goal, steps)
+
+    def softness(self, solution_multiplier: Array, separation: Array) -> Array:
+        """Return dg/dp = g / p = kappa / p^2, (C,)."""
+        return self.kappa / solution_multiplier**2
+
+
+def _pair(x: Array, diagonal: Array, kappa: Array) -> tuple[Array, Array, Array]:
+    """Return p, g and r of the unknown x, without cancellation; all (C,)."""
+    root = jnp.sqrt(x**2 + 4.0 * diagonal * kappa)
+    large = 0.5 * (jnp.abs(x) + root)
+    small = diagonal * kappa / large
+    is_closed = x > 0.0
+    return jnp.where(is_closed, large, small) / diagonal, jnp.where(is_closed, small, large), root
+
+
+def _finish(multiplier: Array, x: Array, error: Array, goal: Array, steps: Array) -> Solution:
+    """Return the solution with a status that is earned by the residual."""
+    error = jnp.abs(error)
+    is_finite = jnp.all(jnp.isfinite(error)) & jnp.all(multiplier > 0.0)
+    status = jnp.where(jnp.all(error <= goal), Status.CONVERGED, Status.NOT_CONVERGED)
+    status = jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32)
+    relative_tolerance = complementarity.RELATIVE_TOLERANCE[str(x.dtype)]
+    relative = relative_tolerance * jnp.max(error / jnp.maximum(goal, jnp.finfo(x.dtype).tiny))
+    return Solution(multiplier, x > 0.0, steps, status, relative)
+
+
+def with_contact(tree: Any, contact_solver: ContactSolver) -> Any:
+    """Return a pytree in which every contact problem is solved by another contact solver.
+
+    Args:
+        tree: a stepper, or anything that holds one: an objective given as `jax.tree_util.Partial`
+            of a function and a stepper, a problem such as `scenes.half_disc_control`.
+        contact_solver: the solver to put in.
+
+    Raises:
+        ValueError: if the tree holds no contact solver.
+    """
+    found = []
+
+    def is_solver(node: Any) -> bool:
+        return hasattr(node, "solve") and hasattr(node, "softness")
+
+    def replace(node: Any) -> Any:
+        if not is_solver(node):
+            return node
+        found.append(node)
+        return contact_solver
+
+    changed = jax.tree.map(replace, tree, is_leaf=is_solver)
+    if not found:
+        raise ValueError(
+            "there is no stepper in this pytree to exchange the contact solver of; hand over a "
+            "bound method of a pytree that holds the stepper, such as problem.objective, or "
+            "jax.tree_util.Partial(function, stepper)"
+        )
+    return changed

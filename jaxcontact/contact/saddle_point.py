@@ -1,0 +1,96 @@
+"""The linear problem of a step whose set of closed pairs is known.
+
+    D dw + N^T dp = dr,    (N dw - s dp)_i = db_i on A,    dp_i = 0 elsewhere.
+
+It is symmetric, so that derivative and adjoint (4.40)-(4.41) are the same solve, by the factor of
+the step. Source: MATH.md 3.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact.contact.complementarity import ContactSolver, solve_on_set
+from jaxcontact.linear import Factor
+from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+
+
+class Fixed(NamedTuple):
+    """What a step uses and never differentiates."""
+
+    columns: Array | np.ndarray | None
+    """Sparsity of D, (width, n) int32; None is dense."""
+
+    unknowns: Array | np.ndarray
+    """Sparsity of N, (C, k) int32."""
+
+    factor: Factor
+    """Factor of D; the derivative by D enters through the values of the matrix instead."""
+
+    resolution: Array
+    """Rounding error of b, (C,)."""
+
+    guess: Array
+    """Active set to start from, (C,) bool."""
+
+    contact_solver: ContactSolver
+    """How the condensed problem is solved; its parameters count as constant."""
+
+
+def solve_on_cone(
+    values: Array,
+    weights: Array,
+    fixed: Fixed,
+    active: Array,
+    softness: Array | None,
+    rhs: Array,
+    bound: Array,
+) -> tuple[Array, Array]:
+    """Solve the saddle-point problem on a fixed active set; symmetric, hence its own transpose.
+
+    Args:
+        values: entries of D, (width, n).
+        weights: entries of N, (C, k).
+        fixed: patterns and the factor.
+        active: A, (C,) bool.
+        softness: s, (C,) or None for zero.
+        rhs: dr, (n,).
+        bound: db, (C,); read on A only.
+
+    Returns:
+        dw (n,) and dp (C,), zero outside A.
+
+    Derivative: of every order, with respect to values, weights, softness, rhs and bound.
+    """
+    matrix = SymmetricMatrix(values, fixed.columns)
+    normals = ContactNormals(weights, fixed.unknowns)
+
+    n = rhs.shape[0]
+
+    # One vector (w, p): custom_linear_solve fails where only one of two parts has a tangent.
+    def saddle_point(unknowns):
+        w, p = unknowns[:n], unknowns[n:]
+        p_active = jnp.where(active, p, 0.0)
+        stretch = normals @ w if softness is None else normals @ w - softness * p
+        balance = matrix @ w + normals.transposed_product(p_active, n)
+        return jnp.concatenate([balance, jnp.where(active, stretch, p)])
+
+    factor, frozen_softness = jax.lax.stop_gradient((fixed.factor, softness))
+
+    def solve(_, data):
+        r, b = data[:n], data[n:]
+        if isinstance(factor, IterativeFactor):
+            return jnp.concatenate(factor.solve_on_set(active, r, b))
+        partial_sweep, free = factor.condense(r)
+        p = solve_on_set(factor.compliance, active, frozen_softness, jnp.where(active, free - b, b))
+        return jnp.concatenate([factor.expand(partial_sweep, jnp.where(active, p, 0.0)), p])
+
+    data = jnp.concatenate([rhs, jnp.where(active, bound, 0.0)])
+    solution = jax.lax.custom_linear_solve(saddle_point, data, solve, symmetric=True)
+    return solution[:n], solution[n:]

@@ -1,0 +1,222 @@
+"""Is the gradient right? Taylor remainders on both sides of a point.
+
+Along a direction d the remainders of a correct derivative J'(u) d,
+
+    R+(h) = J(u + h d) - J(u) - h J'(u) d,    R-(h) = J(u - h d) - J(u) + h J'(u) d,
+
+fall like h^2, on both sides where J is differentiable and on one side at a kink; those of a wrong
+one fall like h. Remainders within the rounding of J say nothing and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from jaxcontact.trajectory import Trajectory
+
+#: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
+NOISE = 64.0
+
+#: Orders that count as second order.
+SECOND_ORDER = 1.8
+
+
+@dataclass(frozen=True)
+class GradientCheck:
+    """The Taylor remainders of a gradient along D directions with H steps, and a verdict."""
+
+    value: float
+    """J(u)."""
+
+    steps: np.ndarray
+    """Step lengths h, (H,), falling by factors of two."""
+
+    derivative: np.ndarray
+    """J'(u) d by the gradient, (D,); the first direction is the gradient itself."""
+
+    remainder: np.ndarray
+    """|R+| and |R-|, (D, 2, H)."""
+
+    central_error: np.ndarray
+    """|[J(u + h d) - J(u - h d)] / (2h) - J'(u) d|, (D, H)."""
+
+    order: np.ndarray
+    """Order of R+ and R- at small steps, (D, 2); infinite if R is rounding, for J affine there."""
+
+    noise: float
+    """Size below which a remainder is rounding."""
+
+    weak_contacts: int | None
+    """Number of (step, pair) in weak contact at u; None if no trajectory was given."""
+
+    contact_changes: int | None
+    """Number of (step, pair) whose contact differs at the largest step; None like above."""
+
+    verdict: str
+    """What follows, in words."""
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the gradient is the derivative, on both sides and along every direction."""
+        return bool(np.all(self.order >= SECOND_ORDER))
+
+    @property
+    def central_relative_error(self) -> np.ndarray:
+        """Smallest error of the central differences relative to the derivative, (D,)."""
+        scale = np.maximum(np.abs(self.derivative), np.finfo(float).tiny)
+        return np.min(self.central_error, axis=1) / scale
+
+    def __str__(self) -> str:
+        """Return the table of remainders and the verdict."""
+        lines = [f"J(u) = {self.value:.10g}"]
+        for i, derivative in enumerate(self.derivative):
+            name = "gradient" if i == 0 else f"random direction {i}"
+            lines.append(f"along the {name}: J'(u) d = {derivative:.8g}")
+            lines.append("        h       |R+(h)|      |R-(h)|   central error")
+            rows = zip(self.steps, *self.remainder[i], self.central_error[i], strict=True)
+            lines += [f"  {h:9.2e}  {a:11.3e}  {b:11.3e}  {c:11.3e}" for h, a, b, c in rows]
+            orders = " and ".join(_order_words(order) for order in self.order[i])
+            lines.append(f"  order {orders}, central difference to {self._central(i)}")
+        if self.weak_contacts is not None:
+            lines.append(
+                f"weak contact on {self.weak_contacts} (step, pair); "
+                f"{self.contact_changes} change within the largest step"
+            )
+        return "\n".join([*lines, self.verdict])
+
+    def _central(self, i: int) -> str:
+        return f"{self.central_relative_error[i]:.1e} relative"
+
+
+def check_gradient(
+    objective: Callable[[Any], Array],
+    u: Any,
+    *,
+    gradient: Any = None,
+    directions: int = 2,
+    step: float = 1e-3,
+    n_steps: int = 10,
+    seed: int = 0,
+    trajectory: Callable[[Any], Trajectory] | None = None,
+) -> GradientCheck:
+    """Check the gradient of an objective along itself and along random directions.
+
+    Args:
+        objective: maps u to a scalar.
+        u: an array, or a pytree of arrays such as the parameters of a network.
+        gradient: what to check, shaped like u; default `jax.grad(objective)(u)`.
+        directions: number of random directions beside the gradient.
+        step: largest step, relative to the norm of u (absolute if u is zero).
+        n_steps: number of steps, each half of the one before.
+        seed: of the random directions.
+        trajectory: maps u to the trajectory, to count weak contact.
+
+    Returns:
+        Remainders, orders and a verdict; print it.
+
+    Raises:
+        ValueError: if the objective is not a scalar.
+    """
+    flat, unravel = ravel_pytree(u)
+    shape = jax.eval_shape(objective, u)
+    if getattr(shape, "shape", None) != ():
+        raise ValueError(f"the objective must return one scalar, got {shape}")
+    evaluate = jax.jit(lambda x: objective(unravel(x)))
+    gradient = jax.jit(jax.grad(objective))(u) if gradient is None else gradient
+    slope = np.asarray(ravel_pytree(gradient)[0])
+    value = float(evaluate(flat))
+
+    random = np.random.default_rng(seed).normal(size=(directions, flat.size))
+    length = float(np.linalg.norm(flat)) or 1.0
+    rows = np.concatenate([slope[None], random])
+    norms = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = rows * (length / np.where(norms > 0.0, norms, 1.0))
+    rows = rows.astype(flat.dtype)
+
+    steps = step * 0.5 ** np.arange(n_steps)
+    derivative = rows @ slope
+    plus, minus = (
+        np.array([[float(evaluate(flat + sign * h * row)) for h in steps] for row in rows])
+        for sign in (1.0, -1.0)
+    )
+    linear = derivative[:, None] * steps
+    remainder = np.abs(np.stack([plus - value - linear, minus - value + linear], axis=1))
+    central = np.abs((plus - minus) / (2.0 * steps) - derivative[:, None])
+    size = max(abs(value), float(np.max(np.abs(derivative))))
+    noise = NOISE * float(np.finfo(flat.dtype).eps) * size
+    order = np.array([[_order(side, noise) for side in both] for both in remainder])
+    quotients = (plus[:, -1] - value) / steps[-1], (value - minus[:, -1]) / steps[-1]
+    weak, changes = _count_contacts(trajectory, unravel, flat, step * rows)
+    return GradientCheck(
+        value=value,
+        steps=steps,
+        derivative=derivative,
+        remainder=remainder,
+        central_error=central,
+        order=order,
+        noise=noise,
+        weak_contacts=weak,
+        contact_changes=changes,
+        verdict=_verdict(order, derivative, quotients, noise / steps[-1], weak),
+    )
+
+
+def _order(remainder: np.ndarray, noise: float) -> float:
+    """Return the order at the smallest steps whose remainder is not rounding."""
+    if not np.all(np.isfinite(remainder)):
+        return np.nan
+    is_noise = np.append(remainder <= noise, True)
+    usable = remainder[: int(np.argmax(is_noise))]
+    if usable.size < 2:
+        # Rounding from the first or second step on: J is affine here.
+        return np.inf
+    return float(np.median(np.log2(usable[:-1] / usable[1:])[-3:]))
+
+
+def _verdict(order, derivative, quotients, noise, weak) -> str:
+    if not np.all(np.isfinite(derivative)) or np.any(np.isnan(order)):
+        return "NOT FINITE: the gradient or the objective is NaN; see Trajectory.status"
+    is_second = order >= SECOND_ORDER
+    if np.all(is_second):
+        hint = "" if not weak else " (weak contact is present, but does not enter here)"
+        return f"RIGHT: second order on both sides along every direction{hint}"
+    right, left = quotients
+    is_kink = np.abs(right - left) > 1e-3 * np.maximum(np.abs(right), np.abs(left)) + 4.0 * noise
+    wrong = ~is_second.any(axis=1)
+    if np.any(wrong & ~is_kink):
+        return (
+            "WRONG: first order on both sides although the one-sided quotients agree; a gradient "
+            "that misses a dependence looks like this"
+        )
+    if np.any(wrong):
+        return (
+            "KINK: the objective has different one-sided derivatives here, and along some "
+            "direction the gradient is neither of them; choose weak_contact=AlongDirection(...)"
+        )
+    return (
+        "ONE-SIDED: the objective has a kink here; the gradient is the exact derivative on one "
+        "side of it"
+    )
+
+
+def _order_words(order: float) -> str:
+    return "exact" if np.isinf(order) else f"{order:.2f}"
+
+
+def _count_contacts(trajectory, unravel, flat, longest) -> tuple[int | None, int | None]:
+    if trajectory is None:
+        return None, None
+    here = trajectory(unravel(flat))
+    changes = 0
+    for row in longest:
+        for sign in (1.0, -1.0):
+            there = trajectory(unravel(flat + sign * row))
+            changes = max(changes, int(np.sum(np.asarray(there.strong) != np.asarray(here.strong))))
+    return int(np.sum(np.asarray(here.weak))), changes

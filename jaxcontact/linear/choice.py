@@ -1,0 +1,82 @@
+"""Which linear solver a system gets when the user names none, and whether its factor fits.
+
+Measured: the dense inverse wins up to a few hundred unknowns, nested dissection beyond, conjugate
+gradients where the factor does not fit in memory. The factor of a mesh of dimension d has about
+9 n log2(n) entries for d <= 2 and 29 n^(4/3) for d = 3 (George 1973; the constants are measured).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+
+import jax
+
+from jaxcontact.linear.conjugate_gradient import ConjugateGradient
+from jaxcontact.linear.dense import Dense
+from jaxcontact.linear.interface import LinearSolver
+from jaxcontact.linear.nested_dissection import NestedDissection
+
+#: Largest number of unknowns for which the dense inverse is the fastest solver.
+DENSE_LIMIT = 300
+
+#: Largest factor that is chosen without asking, [bytes].
+FACTOR_LIMIT = 2 * 2**30
+
+
+def choose_linear_solver(
+    size: int, dimension: int, itemsize: int, *, is_dense: bool = False
+) -> LinearSolver:
+    """Return the solver for n = `size` unknowns in a space of dimension d.
+
+    Args:
+        size: number of unknowns.
+        dimension: space dimension.
+        itemsize: bytes per number.
+        is_dense: the matrices are dense (a reduced model).
+    """
+    if is_dense or size <= DENSE_LIMIT:
+        return Dense()
+    if itemsize * dissection_entries(size, dimension) <= FACTOR_LIMIT:
+        return NestedDissection()
+    return ConjugateGradient()
+
+
+def dissection_entries(size: int, dimension: int) -> float:
+    """Return the estimated number of entries of a nested dissection factor."""
+    if dimension == 3:
+        return 29.0 * size ** (4.0 / 3.0)
+    return 9.0 * size * math.log2(max(size, 2))
+
+
+def check_memory(solver: LinearSolver, size: int, dimension: int, itemsize: int) -> None:
+    """Check that a factor fits in the memory of the machine, as far as that is known.
+
+    Raises:
+        ValueError: if the estimated factor is larger than the available memory.
+    """
+    if isinstance(solver, Dense):
+        # The matrix, its Cholesky factor and its inverse.
+        needed = 3.0 * itemsize * size**2
+    elif isinstance(solver, NestedDissection):
+        needed = itemsize * dissection_entries(size, dimension)
+    else:
+        return
+    available = available_memory()
+    if available is not None and needed > available:
+        raise ValueError(
+            f"the factor of {type(solver).__name__} for {size} unknowns needs about "
+            f"{needed / 2**30:.1f} GiB, {available / 2**30:.1f} GiB are free; use "
+            "linear_solver=jc.ConjugateGradient(), a coarser mesh or float32"
+        )
+
+
+def available_memory() -> int | None:
+    """Return the free memory of the default device, [bytes]; None if it is not known."""
+    stats = jax.devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None

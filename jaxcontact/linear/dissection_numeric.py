@@ -1,0 +1,126 @@
+"""Numeric phase of the nested dissection: front matrices, their inverses and Schur complements.
+
+With the Cholesky factor L of S11 and W = S21 L^-T, a batch of fronts gives
+
+    S11^-1 = L^-T L^-1,    V = S21 S11^-1 = W L^-1,    S22 - V S21^T = S22 - W W^T,
+
+all stages from the leaves to the root, all fronts of a batch at once. Padded own unknowns have a
+unit diagonal and no coupling. A matrix that is not positive definite makes L, and with it every
+later front, NaN.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxcontact.linear.dissection_layout import BatchPlan
+from jaxcontact.sparse import take
+
+_MAX_DOUBLING = 256
+"""Largest triangular matrix that is inverted by doubling; its work is log2(s) / 2 times larger."""
+
+
+@jax.jit
+def factorize_fronts(values: Array, stages: tuple[tuple[BatchPlan, ...], ...]):
+    """Factorise all fronts.
+
+    Args:
+        values: entries of the matrix, (width, n).
+        stages: batches of fronts, leaves first, the root last.
+
+    Returns:
+        Pairs (S11^-1 (F, s, s), V (F, b, s)) of every batch but the root's; S11^-1 of the root,
+        (s, s); True if all pivots are positive, () bool.
+    """
+    blocks, schur, is_positive = [], jnp.zeros(1, values.dtype), jnp.array(True)
+    for stage in stages:
+        stage_blocks, complements = [], []
+        for batch in stage:
+            own_columns, rest = _assemble(batch, values, schur)
+            inverse, coupling, complement, pivots = _eliminate(own_columns, rest)
+            # NaN spreads to all other fronts. The dependence also keeps the batches in sequence:
+            # XLA's CPU runtime may deadlock when several batched LAPACK calls run at once.
+            values = values + 0 * jnp.min(pivots)
+            is_positive &= jnp.all(pivots > 0)
+            stage_blocks.append((inverse, coupling))
+            complements.append(complement.reshape(-1))
+        schur = jnp.concatenate([*complements, jnp.zeros(1, values.dtype)])
+        blocks.append(tuple(stage_blocks))
+    return tuple(blocks[:-1]), blocks[-1][0][0][0], is_positive
+
+
+@jax.jit
+def condense_root(inverse: Array, weights: Array, places: Array):
+    """Apply the contact rows to the root: N_0 S_0^-1, (C, s), and N_0 S_0^-1 N_0^T, (C, C).
+
+    Args:
+        inverse: S_0^-1, (s, s).
+        weights: entries of N, (C, k).
+        places: position of each entry in the root front, (C, k).
+    """
+    response = jnp.einsum("ck,ckj->cj", weights, take(inverse, places))
+    at_contact = take(response.T, places)  # (s,C),(C,k) -> (C,k,C)
+    compliance = jnp.einsum("ck,ckj->cj", weights, at_contact)
+    return response, 0.5 * (compliance + compliance.T)
+
+
+def _assemble(batch, values, schur):
+    """Front matrices: own columns S11 over S21, (F, s + b, s), and S22, (F, b, b)."""
+    n_fronts, s = batch.own.shape
+    b = batch.boundary.shape[1]
+    own = jnp.zeros(n_fronts * (s + b) * s, values.dtype)
+    own = own.at[batch.entries[1]].add(take(values.reshape(-1), batch.entries[0]))
+    own = own.reshape(n_fronts, s + b, s)
+    own = own + jnp.eye(s + b, s, dtype=own.dtype)[None] * batch.is_padding[:, None, :]
+    rest = jnp.zeros((n_fronts, b, b), values.dtype)
+    for child in range(batch.child_base.shape[0]):
+        base = batch.child_base[child][:, None, None]
+        stride = batch.child_stride[child][:, None, None]
+        position = batch.child_position[child]
+
+        def gather(rows, columns, base=base, stride=stride):
+            rows, columns = rows[:, :, None], columns[:, None, :]
+            place = base + rows * stride + columns
+            is_missing = (rows < 0) | (columns < 0)
+            return take(schur, jnp.where(is_missing, schur.shape[0] - 1, place))
+
+        own = own + gather(position, position[:, :s])
+        rest = rest + gather(position[:, s:], position[:, s:])
+    return own, rest
+
+
+def _eliminate(own_columns, rest):
+    """S11^-1, V, the Schur complement and the pivots (diagonal of L) of a batch."""
+    s = own_columns.shape[2]
+    L = jax.lax.linalg.cholesky(own_columns[:, :s], symmetrize_input=False)
+    L_inverse = _invert_triangular(L)
+    W = jnp.einsum("fbj,fij->fbi", own_columns[:, s:], L_inverse)
+    inverse = jnp.einsum("fij,fik->fjk", L_inverse, L_inverse)
+    coupling = jnp.einsum("fbi,fij->fbj", W, L_inverse)
+    complement = rest - jnp.einsum("fbi,fci->fbc", W, W)
+    return inverse, coupling, complement, jnp.diagonal(L, axis1=1, axis2=2)
+
+
+def _invert_triangular(L):
+    """Invert lower triangular matrices, (F, s, s).
+
+    Diagonal blocks of doubling size are inverted together, by products only: the inverse of
+    [[A, 0], [B, C]] is that of diag(A, C) minus its product with B on both sides. XLA's triangular
+    solve is slow on CPUs for many small matrices; the large ones are few and left to it.
+    """
+    s = L.shape[-1]
+    if s > _MAX_DOUBLING:
+        identity = jnp.broadcast_to(jnp.eye(s, dtype=L.dtype), L.shape)
+        return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True)
+    diagonal = jnp.diagonal(L, axis1=1, axis2=2)
+    identity = jnp.eye(s, dtype=L.dtype)[None]
+
+    def double(k, inverse):
+        block = jnp.arange(s) >> k
+        is_pair = (block[:, None] == block[None, :] + 1) & (block[None, :] % 2 == 0)
+        B = jnp.where(is_pair[None], L, 0)
+        return inverse - jnp.einsum("fij,fjk->fik", inverse, jnp.einsum("fij,fjk->fik", B, inverse))
+
+    return jax.lax.fori_loop(0, (s - 1).bit_length(), double, identity / diagonal[:, None, :])

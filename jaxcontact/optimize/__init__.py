@@ -1,0 +1,31 @@
+"""Optimisation in the inner product of the controls: methods, bounds, parametrised controls."""
+
+from jaxcontact.optimize.certificate import Stationarity
+from jaxcontact.optimize.controls import Actuator, actuator, boundary_actuator
+from jaxcontact.optimize.driver import optimize
+from jaxcontact.optimize.homotopy import Homotopy
+from jaxcontact.optimize.lbfgs import LBFGS
+from jaxcontact.optimize.line_search import WeakWolfe
+from jaxcontact.optimize.newton_cg import NewtonCG
+from jaxcontact.optimize.optax_method import Optax
+from jaxcontact.optimize.result import History, Result, load_result
+from jaxcontact.optimize.stationarity import stationarity
+from jaxcontact.optimize.steepest_descent import SteepestDescent
+
+__all__ = [
+    "LBFGS",
+    "Actuator",
+    "History",
+    "Homotopy",
+    "NewtonCG",
+    "Optax",
+    "Result",
+    "Stationarity",
+    "SteepestDescent",
+    "WeakWolfe",
+    "actuator",
+    "boundary_actuator",
+    "load_result",
+    "optimize",
+    "stationarity",
+]

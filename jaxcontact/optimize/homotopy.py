@@ -1,0 +1,190 @@
+"""Homotopy in relaxed contact: a smooth path to a strongly stationary control.
+
+    minimise J_kappa(u),    J_kappa: the objective with p_i g_i = kappa instead of p_i g_i = 0,
+
+by trust-region Newton-CG for a decreasing sequence of kappa, each started at the last minimiser.
+J_kappa is smooth, its Hessian products are exact, and on weak contact its adjoint tends to the one
+with the right share of the multiplier: the path ends at strong stationarity, where methods for
+the exact problem stall at kinks. Source: MATH.md 5.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from jaxcontact.contact.relaxed import RelaxedContact, with_contact
+from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
+from jaxcontact.optimize.problem import Point, Problem
+from jaxcontact.optimize.trust_region import conjugate_gradient_path
+
+#: The first relaxation changes the objective at the start by about this fraction.
+FIRST_CHANGE = 0.15
+
+#: Relative residual and number of products of CG for the last digits of a relaxed problem.
+LAST_FORCING, MAX_LAST_PRODUCTS = 1e-2, 300
+
+#: Trials for the first kappa.
+MAX_TRIALS = 40
+
+
+class HomotopyState(NamedTuple):
+    """Point on the path; level 0 is the start."""
+
+    point: Point
+    """Value and gradient of the exact problem at the current iterate."""
+
+    level: int
+    """Number of relaxed problems that were solved."""
+
+    kappa: float
+    """kappa of the last relaxed problem, [J]; zero before the first."""
+
+    radius: float
+    """Radius of the trust region."""
+
+    first_norm: float
+    """Gradient norm of the exact problem at the start; of the relaxed one if that is zero."""
+
+    norm: float
+    """Gradient norm of the last relaxed problem at its solution."""
+
+
+@dataclass(frozen=True)
+class Homotopy:
+    """Newton-CG on relaxed contact with kappa -> 0; the method that converges at kinks.
+
+    One iteration of `optimize` is one kappa; values in the history are those of the exact problem.
+
+    The contact solver is exchanged inside the objective, so the objective must be a pytree that
+    holds the stepper: a bound method of a registered dataclass, such as
+    `scenes.half_disc_control().objective`, or `jax.tree_util.Partial(function, stepper)`. A
+    change of kappa compiles nothing.
+    """
+
+    first_kappa: float | None = None
+    """First kappa, [J]; None looks for one that changes the objective at the start by 15 %."""
+
+    reduction: float = 0.1
+    """Factor from one kappa to the next."""
+
+    levels: int = 13
+    """Number of kappas. The error of the last solution is about the root of the last kappa."""
+
+    tolerance: float = 1e-9
+    """Each relaxed problem is solved to this times the gradient norm at the start."""
+
+    max_steps: int = 100
+    """Newton steps per kappa."""
+
+    newton: NewtonCG = field(default_factory=lambda: NewtonCG(max_products=300))
+    """Solver of the relaxed problems."""
+
+    def init(self, problem: Problem, point: Point) -> HomotopyState:
+        """Return the state at the start."""
+        norm = problem.gradient_norm(point)
+        return HomotopyState(point, 0, 0.0, math.inf, norm, norm)
+
+    def step(self, problem: Problem, state: HomotopyState) -> tuple[HomotopyState, str | None]:
+        """Return the state after the next kappa, or the same one and why it is the last."""
+        if state.level == self.levels:
+            return state, (
+                f"the relaxation ended at kappa = {state.kappa:.1e} J with a relaxed gradient of "
+                f"{state.norm / (state.first_norm or 1.0):.1e} of the first one"
+            )
+        if state.level == 0 and self.first_kappa is None:
+            kappa, relaxed, start = _first_relaxation(problem, state.point)
+        else:
+            kappa = self.reduction * state.kappa if state.level else self.first_kappa
+            relaxed = _relax(problem, kappa)
+            start = relaxed.evaluate(state.point.parameters)
+        if not math.isfinite(start.value):
+            _count(problem, relaxed)
+            return state, f"the relaxed objective is not finite at kappa = {kappa:.1e} J"
+        # Before touch the exact gradient can be zero where the relaxed one is not.
+        first_norm = state.first_norm or relaxed.gradient_norm(start)
+        inner = NewtonCGState(start, state.radius, first_norm)
+        for _ in range(self.max_steps):
+            if relaxed.gradient_norm(inner.point) <= self.tolerance * first_norm:
+                break
+            following, failure = self.newton.step(relaxed, inner)
+            if failure is not None:
+                following = _newton_step(relaxed, inner)
+            if following is None:
+                break
+            inner = following
+        _count(problem, relaxed)
+        return HomotopyState(
+            point=problem.evaluate(inner.point.parameters),
+            level=state.level + 1,
+            kappa=kappa,
+            radius=inner.radius,
+            first_norm=first_norm,
+            norm=relaxed.gradient_norm(inner.point),
+        ), None
+
+
+def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None:
+    """Return the state after a Newton step that reduces the gradient, or None.
+
+    At the last digits the value is rounding and hides the descent; the gradient still shows it.
+    """
+    point = state.point
+    if problem.bounds is not None:
+        return None
+    path = conjugate_gradient_path(
+        point.derivative,
+        lambda direction: problem.hessian_product(point.parameters, direction),
+        problem.riesz,
+        radius=math.inf,
+        tolerance=LAST_FORCING,
+        max_products=MAX_LAST_PRODUCTS,
+    )
+    step, _, is_cut = path.cut(math.inf)
+    if is_cut:
+        return None
+    trial = problem.evaluate(point.parameters + step)
+    if not problem.gradient_norm(trial) < 0.5 * problem.gradient_norm(point):
+        return None
+    return state._replace(point=trial)
+
+
+def _relax(problem: Problem, kappa: float) -> Problem:
+    """Return the problem with relaxed contact."""
+    return Problem(
+        with_contact(problem.objective, RelaxedContact(kappa)),
+        problem.product,
+        controls=problem.controls,
+        bounds=problem.bounds,
+    )
+
+
+def _count(problem: Problem, relaxed: Problem) -> None:
+    """Count the work on a relaxed problem as work on the problem."""
+    problem.evaluations += relaxed.evaluations
+    problem.hessian_products += relaxed.hessian_products
+
+
+def _first_relaxation(problem: Problem, point: Point) -> tuple[float, Problem, Point]:
+    """Return the kappa that changes the objective at the start by about `FIRST_CHANGE`.
+
+    With it come the relaxed problem and its point at the start.
+    """
+    kappa = 1.0
+    relaxed = _relax(problem, kappa)
+    for _ in range(MAX_TRIALS):
+        start = relaxed.evaluate(point.parameters)
+        change = abs(start.value - point.value) / max(abs(point.value), 1e-300)
+        factor = FIRST_CHANGE / max(change, 1e-300) if math.isfinite(change) else 0.0
+        if 0.2 <= factor <= 5.0:
+            return kappa, relaxed, start
+        # The change is about proportional to kappa, unless rounding or overflow hides it.
+        kappa *= min(max(factor, 1e-6), 1e6)
+        evaluations = relaxed.evaluations
+        relaxed = _relax(problem, kappa)
+        relaxed.evaluations = evaluations
+    raise ValueError(
+        "no relaxation of contact changes the objective at the start by a fraction of it; is there "
+        "any contact, and is the value at the start not zero? Otherwise give first_kappa"
+    )

@@ -1,0 +1,63 @@
+"""The certificate of strong stationarity for a control of any origin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
+from jaxcontact.optimize.driver import state_problem
+from jaxcontact.optimize.inner_products import InnerProduct
+from jaxcontact.optimize.problem import as_partial
+from jaxcontact.system import System
+from jaxcontact.trajectory import Trajectory
+
+
+def stationarity(
+    objective: Callable[[Array], Array],
+    u: Array,
+    *,
+    system: System | None = None,
+    dt: float | Array | None = None,
+    bounds: tuple[Any, Any] | None = None,
+    controls: Any = None,
+    inner_product: InnerProduct | None = None,
+    motion: Callable[[Array], Trajectory] | None = None,
+    tolerance: float = 1e-4,
+) -> Stationarity:
+    """Certify a control on the exact problem: is it strongly stationary, (4.32)-(4.33)?
+
+    Costs one simulation, one gradient, and one gradient per weak pair.
+
+    Args:
+        objective: maps a control (T, N, d) to a scalar; a pytree that holds the stepper: a bound
+            method of a registered dataclass, or `jax.tree_util.Partial(function, stepper)`.
+        u: the control, or the argument of the map `controls`.
+        system: the discretised scene, which defines the inner product.
+        dt: length of a time step, [s].
+        bounds: lower and upper bound of u, see `optimize`.
+        controls: linear map from parameters to controls.
+        inner_product: used instead of the one of system and dt.
+        motion: maps a control to the trajectory that the objective sees, recorded in every step;
+            default the method `simulate` of the object whose bound method the objective is.
+        tolerance: a pair is in weak contact if gap and impulse are below this times their largest
+            values in the motion (impulses also below this times the momentum of a node).
+
+    Returns:
+        The certificate.
+
+    Raises:
+        ValueError: if the motion is not known or not recorded in every step.
+    """
+    u = jnp.asarray(u)
+    problem = state_problem(objective, u, system, dt, bounds, controls, inner_product)
+    motion = motion_of(problem) if motion is None else as_partial(motion)
+    if motion is None:
+        raise ValueError(
+            "the objective does not tell its motion; hand over motion=, a bound method or "
+            "jax.tree_util.Partial that maps a control to the trajectory"
+        )
+    return certify(problem, u, motion, tolerance)
