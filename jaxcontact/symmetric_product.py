@@ -39,14 +39,16 @@ def symmetric_product(values: Array, columns: Array | np.ndarray, x: Array) -> A
     return _product.bind(values, columns, x, is_transposed=False)
 
 
-def outer_on_pattern(columns: Array | np.ndarray, left: Array, right: Array) -> Array:
+def outer_on_pattern(columns: Array | np.ndarray | None, left: Array, right: Array) -> Array:
     """Return left_i right_j on a sparsity pattern, (width, n): the cotangent of the entries.
 
     Args:
-        columns: column of each entry, (width, n) int32.
+        columns: column of each entry, (width, n) int32; None is dense.
         left: vector (n,) or columns (n, r), which are summed.
         right: like left.
     """
+    if columns is None:
+        return jnp.outer(left, right) if left.ndim == 1 else left @ right.T
     outer = left[None] * take(right, columns)
     return jnp.sum(outer, axis=2) if left.ndim == 2 else outer
 

@@ -13,8 +13,10 @@ import jaxcontact as jc
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import bars  # noqa: E402
-import impact_table  # noqa: E402
+import against_getfem
+import bars
+import impact_table
+import work_precision
 
 SECOND_ORDER = [jc.ContactImplicit(), jc.ContactStabilized(), jc.RedistributedMass()]
 STABLE = [*SECOND_ORDER, jc.BackwardEuler()]
@@ -113,3 +115,40 @@ def test_scheme_converges_through_an_impact_in_the_mean_over_its_phases(scheme, 
 def test_contact_implicit_force_does_not_converge_at_fixed_courant_number():
     errors = [mean_errors("P2", jc.ContactImplicit(), n)[1] for n in (COARSE, FINE)]
     np.testing.assert_allclose(errors, 0.29, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_impact_table_quick_mode_writes_rows_for_every_scheme(tmp_path):
+    tables = impact_table.main(["--quick", "--out", str(tmp_path)])
+    assert {row["scheme"] for row in tables["one_impact"]} == set(impact_table.SCHEMES)
+    assert {row["scheme"] for row in tables["ten_impacts"]} == set(impact_table.SCHEMES)
+    assert (tmp_path / "impact_table.json").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_work_precision_quick_mode_measures_and_draws_all_four_errors(tmp_path):
+    rows = work_precision.main(["--quick", "--repeats", "2", "--out", str(tmp_path)])
+    assert {row["problem"] for row in rows} == {"P2", "half disc"}
+    for row in rows:
+        assert all(0.0 < row[quantity] < 1.0 for quantity in work_precision.QUANTITIES), row
+        assert row["run_s"] > 0.0
+        assert row["gradient_s"] > 0.0
+    assert (tmp_path / "work_precision.png").stat().st_size > 10_000
+
+
+def test_work_precision_front_keeps_what_no_other_run_beats():
+    runs = [(1.0, 0.5), (2.0, 0.6), (3.0, 0.1), (0.5, 0.9), (3.5, 0.1)]
+    assert work_precision.pareto(runs) == [(0.5, 0.9), (1.0, 0.5), (3.0, 0.1)]
+
+
+@pytest.mark.slow
+def test_against_getfem_agrees_or_says_what_to_install(tmp_path, capsys):
+    rows = against_getfem.main(["--quick", "--repeats", "2", "--out", str(tmp_path)])
+    if rows is None:
+        assert "python3-getfem" in capsys.readouterr().out
+        return
+    for row in rows:
+        # Two programs, one scheme, 100 steps: rounding up to the first touch and after it.
+        assert row["difference_first_touch"] < 1e-11
+        assert row["difference"] < 1e-9 or row["scheme"] == "Trapezoidal"
+        assert row["us_per_step"] < row["us_per_step_getfem"]

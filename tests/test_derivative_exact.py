@@ -60,7 +60,8 @@ def discrete_jacobian(n_cells):
         return outcome(parameters, phase), jax.jacrev(outcome)(parameters, phase)
 
     values, jacobians = jax.jit(jax.vmap(both, in_axes=(None, 0)))(
-        jnp.array([float(x) for x in (EXACT.impact_speed, EXACT.density, EXACT.young, EXACT.gap)]), PHASES
+        jnp.array([float(x) for x in (EXACT.impact_speed, EXACT.density, EXACT.young, EXACT.gap)]),
+        PHASES,
     )
     return values.mean(axis=0), jacobians.mean(axis=0)
 
@@ -71,7 +72,9 @@ PARAMETERS = ("velocity", "density", "stiffness", "gap")
 @pytest.mark.parametrize("row", [0, 1], ids=["rebound", "impulse"])
 @pytest.mark.parametrize("column", range(4), ids=PARAMETERS)
 def test_gradient_of_the_bar_converges_to_the_exact_one(row, column):
-    point = jnp.array([float(x) for x in (EXACT.impact_speed, EXACT.density, EXACT.young, EXACT.gap)])
+    point = jnp.array(
+        [float(x) for x in (EXACT.impact_speed, EXACT.density, EXACT.young, EXACT.gap)]
+    )
     exact = np.asarray(jax.jacrev(exact_outcome)(point))[row, column]
     # Elasticities: derivative times parameter over outcome.
     scale = float(point[column]) / float(exact_outcome(point)[row])

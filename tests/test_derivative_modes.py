@@ -21,8 +21,8 @@ INITIAL = jc.State(VALUES["displacement"], VALUES["velocity"])
 CONTROL = VALUES["control"]
 
 
-def value(control, stepper=STEPPER, initial=INITIAL):
-    return cost(jc.simulate(stepper, control, initial=initial))
+def value(control, stepper=STEPPER, initial=INITIAL, weak_contact=None):
+    return cost(jc.simulate(stepper, control, initial=initial, weak_contact=weak_contact))
 
 
 GRADIENT = jax.jit(jax.grad(value))(CONTROL)
@@ -40,9 +40,21 @@ def test_gradient_by_vjp_and_by_jvp_and_without_jit_agree():
     direction = random_like(CONTROL)
     _, pull = jax.vjp(value, CONTROL)
     assert relative(pull(jnp.array(1.0))[0], GRADIENT) <= ROUNDING
-    _, forward = jax.jvp(value, (CONTROL,), (direction,))
+    for choice in (jc.Strong(), jc.Inactive(), jc.CriticalCone()):
+        _, forward = jax.jvp(
+            lambda u, choice=choice: value(u, weak_contact=choice), (CONTROL,), (direction,)
+        )
+        check_same(forward, direction)
+
+
+def check_same(forward, direction):
     scale = float(jnp.linalg.norm(GRADIENT) * jnp.linalg.norm(direction))
     assert abs(float(forward) - float(jnp.vdot(GRADIENT, direction))) <= ROUNDING * scale
+
+
+def test_forward_mode_without_a_named_treatment_of_weak_contact_is_refused():
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(value, (CONTROL,), (CONTROL,))
 
 
 def test_jacobian_by_rows_and_by_columns_agree():
@@ -51,7 +63,7 @@ def test_jacobian_by_rows_and_by_columns_agree():
         return final_of(CONTROL + lift)
 
     def final_of(control):
-        trajectory = jc.simulate(STEPPER, control, initial=INITIAL)
+        trajectory = jc.simulate(STEPPER, control, initial=INITIAL, weak_contact=jc.Strong())
         return jnp.concatenate([trajectory.velocity[-1, :3].ravel(), trajectory.gap[-1]])
 
     rows = jax.jacrev(by_nodes)(jnp.zeros((1, 3)))

@@ -153,8 +153,8 @@ def products(young, viscosity, height, tilt, control, direction, weight):
     initial = jc.State(jnp.zeros_like(fall), fall)
     stepper = jc.prepare(jc.discretize(scene), DT)
 
-    def end(u):
-        trajectory = jc.simulate(stepper, u, initial=initial)
+    def end(u, choice=None):
+        trajectory = jc.simulate(stepper, u, initial=initial, weak_contact=choice)
         return jnp.concatenate(
             [
                 trajectory.velocity[-1].ravel(),
@@ -163,7 +163,9 @@ def products(young, viscosity, height, tilt, control, direction, weight):
             ]
         ), jnp.sum(trajectory.active)
 
-    _, tangent, count = jax.jvp(end, (control,), (direction,), has_aux=True)
+    _, tangent, count = jax.jvp(
+        lambda u: end(u, jc.Strong()), (control,), (direction,), has_aux=True
+    )
     cotangent = jnp.resize(weight, tangent.shape)
     _, pull, _ = jax.vjp(end, control, has_aux=True)
     pulled = pull(cotangent)[0]

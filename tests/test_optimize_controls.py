@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.tree_util import Partial
 
 import jaxcontact as jc
 from jaxcontact.inner_product import control_dot
@@ -101,24 +102,29 @@ def test_boundary_actuator_norm_is_the_l2_norm_of_the_traction(scene):
     assert float(product.dot(ones, ones)) == pytest.approx(2.0 * 1.0 * 0.7)
 
 
+def _distance(system, target, u):
+    return 0.5 * control_dot(system, DT, u - target, u - target)
+
+
 def tracking(system):
-    target = random_like(jnp.zeros((STEPS, system.n_nodes, 2)), 4)
-
-    def objective(u):
-        return 0.5 * control_dot(system, DT, u - target, u - target)
-
-    return objective
+    return Partial(_distance, system, random_like(jnp.zeros((STEPS, system.n_nodes, 2)), 4))
 
 
-@each_actuator
+@pytest.mark.parametrize("name", ["region", "boundary pressure"])
 @pytest.mark.parametrize(
     "method",
-    [jc.SteepestDescent(), jc.LBFGS(), jc.NewtonCG(forcing=1e-10), jc.Optax(optax.adam(0.02))],
+    [
+        jc.SteepestDescent(),
+        jc.LBFGS(memory=5),
+        jc.NewtonCG(forcing=1e-6),
+        # The boundary has a curvature of about 1 / h.
+        jc.Optax(optax.sgd(0.02, momentum=0.9)),
+    ],
     ids=lambda method: type(method).__name__,
 )
-def test_optimize_over_actuators_finds_the_best_admissible_control(scene, make, method):
+def test_optimize_over_actuators_finds_the_best_admissible_control(scene, name, method):
     mesh, system = scene
-    actuator = make(mesh, system)
+    actuator = ACTUATORS[name](mesh, system)
     objective = tracking(system)
     result = jc.optimize(
         objective,
@@ -127,12 +133,12 @@ def test_optimize_over_actuators_finds_the_best_admissible_control(scene, make, 
         system=system,
         dt=DT,
         controls=actuator,
-        iterations=150,
+        tolerance=1e-4,
+        iterations=300,
     )
-    derivative = jax.grad(lambda p: objective(actuator(p)))
+    derivative = jax.jit(jax.grad(lambda p: objective(actuator(p))))
     first = float(jnp.max(jnp.abs(derivative(actuator.zeros()))))
-    tolerance = 0.05 if isinstance(method, jc.Optax) else 1e-4
-    assert float(jnp.max(jnp.abs(derivative(result.parameters)))) < tolerance * first
+    assert float(jnp.max(jnp.abs(derivative(result.parameters)))) < 1e-3 * first
     np.testing.assert_array_equal(result.control, actuator(result.parameters))
 
 

@@ -82,3 +82,19 @@ def test_lbfgs_solves_the_nonsmooth_rosenbrock_function():
     start = jnp.array([-1.0, 2.0])
     result = jc.optimize(Partial(banana), start, inner_product=EUCLIDEAN, iterations=400)
     assert result.value < 1e-6
+
+
+def _ellipsoid(curvatures, x):
+    return 0.5 * jnp.sum(curvatures * (x - 1.0) ** 2)
+
+
+def test_lbfgs_needs_no_more_evaluations_for_a_scaled_objective():
+    counts = []
+    for scale in (1.0, 1e6):
+        objective = Partial(_ellipsoid, scale * jnp.linspace(1.0, 30.0, 40))
+        options = {"method": jc.LBFGS(memory=4), "inner_product": EUCLIDEAN, "tolerance": 1e-6}
+        result = jc.optimize(objective, jnp.zeros(40), **options)
+        assert result.status.startswith("converged")
+        counts.append(int(result.history.evaluations[-1]))
+    # The first search alone pays for the scale, by log2(1e6) = 20 bisections.
+    assert counts[1] <= counts[0] + 25

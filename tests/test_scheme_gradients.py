@@ -1,4 +1,4 @@
-"""Exact gradients of every scheme: Taylor remainders of second order, on the bar and the half disc."""
+"""Exact gradients of every scheme: Taylor remainders of second order on bar and half disc."""
 
 import dataclasses
 
@@ -74,7 +74,9 @@ def prepared(scheme):
 @by_scheme
 def test_scheme_gradient_of_a_thrown_bar_passes_the_taylor_test(scheme, parameter):
     objective = jax.jit(lambda p: PARAMETERS[parameter](scheme, p))
-    assert_taylor(objective, jnp.asarray(1.0), jnp.asarray(1.0), [4e-6, 2e-6, 1e-6])
+    # The motion depends little on the viscosity: smaller steps would show rounding only.
+    size = 1e-4 if parameter == "viscosity" else 1e-6
+    assert_taylor(objective, jnp.asarray(1.0), jnp.asarray(1.0), [4 * size, 2 * size, size])
 
 
 @by_scheme

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxcontact.schemes.mass_redistribution import redistribute
 
 import jaxcontact as jc
+from jaxcontact.schemes.mass_redistribution import redistribute
 
 SCHEMES = [
     jc.ContactImplicit(),
@@ -225,8 +225,10 @@ def test_redistributed_mass_refuses_a_node_with_two_normals():
 
 def test_redistributed_mass_refuses_a_mesh_without_inside():
     mesh = jc.meshes.interval(1.0, h=1.0)
-    wall = {side: jc.HalfSpace(np.array([x]), np.array([n])) for side, x, n in
-            (("left", -1.0, 1.0), ("right", 2.0, -1.0))}
+    wall = {
+        side: jc.HalfSpace(np.array([x]), np.array([n]))
+        for side, x, n in (("left", -1.0, 1.0), ("right", 2.0, -1.0))
+    }
     system = jc.discretize(jc.Scene(mesh, bodies.ELASTIC, contact=wall))
     with pytest.raises(ValueError, match="ContactStabilized"):
         jc.prepare(system, 0.01, scheme=jc.RedistributedMass())

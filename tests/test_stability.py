@@ -12,13 +12,14 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxcontact.contact import Status
 
 import jaxcontact as jc
+from jaxcontact.contact import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import bars  # noqa: E402
+import bars
+import stability_map
 
 DISSIPATIVE = [jc.ContactImplicit(), jc.ContactStabilized(), jc.BackwardEuler()]
 STABLE = [*DISSIPATIVE, jc.RedistributedMass()]
@@ -332,3 +333,14 @@ def test_scheme_agrees_in_float32_with_float64(scheme):
     # 280 steps; the total form of the step would lose eps |y| / dt in each of them.
     np.testing.assert_allclose(found[1].displacement, found[0].displacement, rtol=0.02)
     np.testing.assert_allclose(found[1].final_energy, found[0].final_energy, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_stability_map_quick_mode_shows_who_gains_energy_and_who_chatters(tmp_path):
+    rows = stability_map.main(["--quick", "--out", str(tmp_path)])
+    growth = {(row["scheme"], row["courant"]): row["energy_growth"] for row in rows}
+    chatter = {(row["scheme"], row["courant"]): row["oscillation"] for row in rows}
+    assert growth["Trapezoidal", 1.0] > 1.5
+    assert growth["ContactImplicit", 1.0] < 1.0 + 1e-12
+    assert chatter["ContactStabilized", 1.0] < 0.1 * chatter["Trapezoidal", 1.0]
+    assert (tmp_path / "stability_map.png").stat().st_size > 10_000

@@ -177,6 +177,9 @@ def _order(remainder: np.ndarray, noise: float) -> float:
     if usable.size < 2:
         # Rounding from the first or second step on: J is affine here.
         return np.inf
+    if usable.size < remainder.size and usable[-1] > 8.0 * noise:
+        # From far above straight into rounding: affine from this step on, a kink lies beyond.
+        return np.inf
     return float(np.median(np.log2(usable[:-1] / usable[1:])[-3:]))
 
 

@@ -93,10 +93,10 @@ class Homotopy:
                 f"the relaxation ended at kappa = {state.kappa:.1e} J with a relaxed gradient of "
                 f"{state.norm / (state.first_norm or 1.0):.1e} of the first one"
             )
-        if state.level == 0 and self.first_kappa is None:
+        kappa = self.reduction * state.kappa if state.level else self.first_kappa
+        if kappa is None:
             kappa, relaxed, start = _first_relaxation(problem, state.point)
         else:
-            kappa = self.reduction * state.kappa if state.level else self.first_kappa
             relaxed = _relax(problem, kappa)
             start = relaxed.evaluate(state.point.parameters)
         if not math.isfinite(start.value):

@@ -79,7 +79,9 @@ def from_symmetric(matrix: SymmetricMatrix, dimension: int) -> BlockMatrix:
     d, n_nodes = dimension, matrix.size // dimension
     width = matrix.columns.shape[0] // d
     nodes = np.asarray(matrix.columns).reshape(width, d, n_nodes, d)[:, 0, :, 0] // d
-    blocks = on_host(matrix.values).reshape(width, d, n_nodes, d).transpose(0, 2, 3, 1)  # (slot, row, i, j)
+    blocks = (
+        on_host(matrix.values).reshape(width, d, n_nodes, d).transpose(0, 2, 3, 1)
+    )  # (slot, row, i, j)
     rows = np.broadcast_to(np.arange(n_nodes), (width, n_nodes))
     # Padded slots name their own row and hold zeros, so they only add zeros to the diagonal.
     return _sum_duplicates(rows.ravel(), nodes.ravel(), blocks.reshape(-1, d, d))

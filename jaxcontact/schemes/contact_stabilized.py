@@ -88,9 +88,7 @@ class ContactStabilized:
         u, predicted = operators.predictor.solve(operators.mass @ v, **contact)
         rhs = operators.mass @ u - 0.5 * dt * (system.stiffness @ y - load)
         w, solution = operators.problem.solve(rhs, **contact)
-        new = StepState(
-            y + dt * w, v + 2.0 * (w - u), 2.0 * solution.multiplier, solution.active
-        )
+        new = StepState(y + dt * w, v + 2.0 * (w - u), 2.0 * solution.multiplier, solution.active)
         return new, StepInfo(
             jnp.maximum(predicted.iterations, solution.iterations),
             jnp.maximum(predicted.status, solution.status),

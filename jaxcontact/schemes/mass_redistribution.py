@@ -4,39 +4,45 @@
 
 E replaces the normal velocity of a contact node by that of the body just inside: (E v)_i =
 (I - nu nu^T) v_i + nu nu^T sum_j w_ij v_j with nodes j inside, sum_j w_ij = 1 and no tangential
-offset, sum_j w_ij (I - nu nu^T)(x_j - x_i) = 0. E^T M E is positive semidefinite with the kernel N^T
-and the total mass of M, but it moves the centre of mass by O(h^2). C, one small block on each node
-inside, is the smallest correction that gives every rigid velocity field (1D: every affine one) its
-kinetic energy back: total mass, centre of mass and inertia are then those of M.
+offset, sum_j w_ij (I - nu nu^T)(x_j - x_i) ~ 0. E^T M E is positive semidefinite with the kernel
+N^T and the total mass of M, but it moves the centre of mass by O(h^2). C, one small block on each
+node inside, is the smallest correction that gives every rigid velocity field (1D: every affine
+one) its kinetic energy back: total mass, centre of mass and inertia are then those of M.
 
-Extrapolating affine fields exactly (w with sum_j w_ij x_j = x_i) needs no C, but puts 8/3 of a cell's
-mass on the first node of a bar, which rings after an impact: three times the error of the force.
+Extrapolating affine fields exactly (w with sum_j w_ij x_j = x_i) needs no C, but puts 8/3 of a
+cell's mass on the first node of a bar, which rings after an impact: three times the error of the
+force.
 
-Source: Khenous, Laborde, Renard, Eur. J. Mech. A/Solids 27 (2008) 918-932, 4, for the moments and
-the smallest correction; Hager, Hueeber, Wohlmuth, Int. J. Numer. Meth. Engng 73 (2008) 1206-1225 for
-moving the mass to the neighbours.
+Source: Khenous, Laborde, Renard, Eur. J. Mech. A/Solids 27 (2008) 918-932, for the moments and
+the smallest correction; Hager, Hueeber, Wohlmuth, Int. J. Numer. Meth. Engng 73 (2008) 1206-1225,
+for moving the mass to the neighbours.
 """
 
 from __future__ import annotations
 
 import itertools
+from types import ModuleType
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.schemes.block_matrix import BlockMatrix, from_symmetric
+from jaxcontact.schemes.block_matrix import BlockMatrix, from_symmetric, on_host, scatter
 from jaxcontact.system import System
+
+#: How dear a tangential offset of a donor is, against a distant donor.
+OFFSET_PENALTY = 1e4
 
 
 def redistribute(system: System) -> BlockMatrix:
     """Return M_r, singular: M_r N^T = 0.
 
-    Raises:
-        ValueError: if the contact pairs are not one per node, node positions or normals are
-            traced, or a contact node has too few nodes inside the body near it.
+    Traceable in every value of the system; which nodes receive mass follows from the mesh alone.
 
-    Derivative: with respect to the values of the mass matrix.
+    Raises:
+        ValueError: if the contact pairs are not one per node, a contact node has too few nodes
+            inside the body near it, or the mesh is so coarse that M_r is indefinite.
     """
     _check_pairs(system)
     inward = _inward_shift(system)
@@ -49,22 +55,51 @@ def redistribute(system: System) -> BlockMatrix:
 def tangential_projection(system: System) -> BlockMatrix:
     """Return I - Q with Q = N^T N."""
     n_nodes, d = len(system.free_nodes), system.dimension
-    normals = np.asarray(system.normals.weights)
-    nodes = np.asarray(system.node_numbers)[np.asarray(system.contact_nodes)]
-    blocks = np.tile(np.eye(d, dtype=normals.dtype), (n_nodes, 1, 1))
-    np.subtract.at(blocks, nodes, np.einsum("ci,cj->cij", normals, normals))
-    return BlockMatrix(np.arange(n_nodes), np.arange(n_nodes), blocks)
+    normals = on_host(system.normals.weights)
+    pairs = np.asarray(system.node_numbers)[np.asarray(system.contact_nodes)]
+    outer = normals[:, :, None] * normals[:, None, :]
+    identity = np.tile(np.eye(d, dtype=system.dtype), (n_nodes, 1, 1))
+    nodes = np.arange(n_nodes)
+    return BlockMatrix(nodes, nodes, identity - scatter(outer, pairs, n_nodes))
 
 
 def _inward_shift(system: System) -> BlockMatrix:
     """Return E."""
     number = np.asarray(system.node_numbers)
-    pairs, donors, weights = _stencils(system)
-    normals = np.asarray(system.normals.weights)[pairs]
-    blocks = np.einsum("z,zi,zj->zij", weights, normals, normals).astype(system.dtype)
-    owners = np.asarray(system.contact_nodes)[pairs]
-    shift = BlockMatrix(number[owners], number[donors], blocks)
+    contact_nodes = np.asarray(system.contact_nodes)
+    points, normals = on_host(system.points), on_host(system.normals.weights)
+    pairs, donors, size = _donors(system)
+    offsets = points[donors] - points[contact_nodes[pairs]]  # (z, d)
+    # Donors of one contact node are a row of the table; missing ones have no weight.
+    column = np.arange(pairs.size) - np.searchsorted(pairs, pairs)
+    table = np.zeros((contact_nodes.size, size), int)
+    table[pairs, column] = np.arange(pairs.size)
+    is_donor = np.zeros(table.shape, bool)
+    is_donor[pairs, column] = True
+    weights = _shift_weights(offsets[table], is_donor, normals)[pairs, column]
+    along = normals[pairs]
+    blocks = weights[:, None, None] * along[:, :, None] * along[:, None, :]
+    shift = BlockMatrix(number[contact_nodes[pairs]], number[donors], blocks)
     return tangential_projection(system).plus(shift)
+
+
+def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray:
+    """Return weights (C, m) with sum 1, small tangential offset and few distant donors.
+
+    The minimum of sum_j (w_j |x_j|)^2 + penalty |sum_j w_j t_j|^2 with the tangential offsets t_j.
+    """
+    xp = _numpy_of(offsets, normals)
+    squares = xp.sum(offsets**2, axis=2)
+    size = xp.max(xp.where(is_donor, squares, 0.0), axis=1)[:, None]
+    normal_part = xp.sum(offsets * normals[:, None, :], axis=2)
+    tangential = offsets - normal_part[:, :, None] * normals[:, None, :]
+    tangential = xp.where(is_donor[:, :, None], tangential, 0.0)
+    distances = xp.where(is_donor, squares / size, 1.0)
+    matrix = OFFSET_PENALTY * tangential @ xp.swapaxes(tangential, 1, 2) / size[:, :, None]
+    matrix = matrix + distances[:, :, None] * np.eye(is_donor.shape[1], dtype=distances.dtype)
+    ones = is_donor.astype(distances.dtype)
+    raw = xp.linalg.solve(matrix, ones[:, :, None])[:, :, 0] * ones
+    return raw / xp.sum(raw, axis=1)[:, None]
 
 
 def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
@@ -74,34 +109,66 @@ def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     """
     free = np.asarray(system.free_nodes)
     inside = np.flatnonzero(~np.isin(free, np.asarray(system.contact_nodes)))
-    fields = _rigid_fields(np.asarray(system.points)[free])  # (n,i,k)
-    fields = fields.astype(system.dtype)
+    fields = _rigid_fields(on_host(system.points)[free])  # (n, i, k)
     lost = from_symmetric(system.mass, system.dimension).plus(mass.scaled(-1.0))
-    pairs = fields[lost.rows].swapaxes(1, 2) @ lost.blocks @ fields[lost.columns]
-    missing = pairs.sum(axis=0)
-    volumes = np.asarray(system.nodal_mass.values).sum(axis=0)[free[inside]]
-    gram = np.einsum("nik,nil->nkl", fields[inside], fields[inside])
-    equations = np.einsum("nab,n,ncd->acbd", gram, volumes, gram, optimize=True)
-    k = gram.shape[1]
-    inverse = np.linalg.pinv(equations.reshape(k * k, k * k), hermitian=True)
-    T = (inverse.astype(system.dtype) @ missing.reshape(-1)).reshape(k, k)
+    columns = fields[lost.columns]
+    missing = (fields[lost.rows].swapaxes(1, 2) @ lost.blocks @ columns).sum(axis=0)
+    volumes = on_host(system.nodal_mass.values).sum(axis=0)[free[inside]]
     rigid = fields[inside]
-    weighted = rigid * volumes[:, None, None].astype(system.dtype)
-    blocks = weighted @ (0.5 * (T + T.T)) @ rigid.swapaxes(1, 2)
+    gram = rigid.swapaxes(1, 2) @ rigid
+    k = gram.shape[1]
+    flat = gram.reshape(-1, k * k)
+    equations = (flat.T @ (volumes[:, None] * flat)).reshape(k, k, k, k)
+    equations = equations.transpose(0, 2, 1, 3).reshape(k * k, k * k)
+    xp = _numpy_of(fields, missing)
+    T = (xp.linalg.pinv(equations, hermitian=True) @ missing.reshape(-1)).reshape(k, k)
+    blocks = volumes[:, None, None] * (rigid @ (0.5 * (T + T.T)) @ rigid.swapaxes(1, 2))
     return BlockMatrix(inside, inside, blocks)
 
 
-def _rigid_fields(points: np.ndarray) -> np.ndarray:
+def _rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
     """Return translations and rotations (1D: translation and stretch) at the points, (n, d, k)."""
+    xp = _numpy_of(points)
     n, d = points.shape
-    x = points - points.mean(axis=0)
-    x = x / np.abs(x).max()
-    fields = [np.broadcast_to(axis, (n, d)) for axis in np.eye(d)]
+    x = points - points.mean(axis=0)[None, :]
+    x = x / abs(x).max()
+    fields = [xp.broadcast_to(xp.asarray(axis)[None, :], (n, d)) for axis in np.eye(d)]
     for i, j in itertools.combinations(range(d), 2):
-        rotation = np.zeros((n, d))
-        rotation[:, i], rotation[:, j] = -x[:, j], x[:, i]
-        fields.append(rotation)
-    return np.stack([*fields, x] if d == 1 else fields, axis=-1)
+        turn = np.zeros((d, d))
+        turn[i, j], turn[j, i] = 1.0, -1.0
+        fields.append(x @ turn)
+    if d == 1:
+        fields.append(x)
+    return xp.stack(fields, axis=-1).astype(points.dtype)
+
+
+def _donors(system: System) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return contact pair and donor node of every term of the shift, and the most donors of one."""
+    is_donor = np.zeros(system.n_nodes, bool)
+    is_donor[np.asarray(system.free_nodes)] = True
+    is_donor[np.asarray(system.contact_nodes)] = False
+    neighbours = np.asarray(system.nodal_mass.columns).T
+    pairs, donors = [], []
+    for pair, node in enumerate(np.asarray(system.contact_nodes)):
+        ring = np.array([node])
+        for _ in range(3):
+            ring = np.unique(neighbours[ring])
+            inside = ring[is_donor[ring]]
+            if inside.size >= system.dimension:
+                break
+        if not inside.size:
+            raise ValueError(
+                f"contact node {node} has no free node outside the contact set near it that its "
+                "mass could move to; refine the mesh, or use jc.ContactStabilized()"
+            )
+        pairs.append(np.full(inside.size, pair))
+        donors.append(inside)
+    return np.concatenate(pairs), np.concatenate(donors), max(map(len, donors))
+
+
+def _numpy_of(*values: Array | np.ndarray) -> ModuleType:
+    """Return jax.numpy if a value is traced, else numpy."""
+    return jnp if any(isinstance(value, Tracer) for value in values) else np
 
 
 def _check_semidefinite(system: System, mass: BlockMatrix) -> None:
@@ -117,58 +184,8 @@ def _check_semidefinite(system: System, mass: BlockMatrix) -> None:
         )
 
 
-def _stencils(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return contact pair, donor node and weight of every term of the shift, (Z,) each."""
-    points = np.asarray(system.points)
-    contact_nodes = np.asarray(system.contact_nodes)
-    is_donor = np.zeros(len(points), bool)
-    is_donor[np.asarray(system.free_nodes)] = True
-    is_donor[contact_nodes] = False
-    neighbours = np.asarray(system.nodal_mass.columns).T
-    pairs, donors, weights = [], [], []
-    for pair, node in enumerate(contact_nodes):
-        normal = np.asarray(system.normals.weights)[pair]
-        ring = np.array([node])
-        for _ in range(4):
-            ring = np.unique(neighbours[ring])
-            inside = ring[is_donor[ring]]
-            found = _shift_weights(points[inside] - points[node], normal)
-            if found is not None:
-                break
-        else:
-            raise ValueError(
-                f"contact node {node} has too few free nodes outside the contact set near it that "
-                "its mass could move to; refine the mesh, or use jc.ContactStabilized()"
-            )
-        pairs.append(np.full(inside.size, pair))
-        donors.append(inside)
-        weights.append(found)
-    return np.concatenate(pairs), np.concatenate(donors), np.concatenate(weights)
-
-
-def _shift_weights(offsets: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
-    """Return the smallest weights (Z,) with sum 1 and without tangential offset, or None."""
-    d = len(normal)
-    if len(offsets) < d:
-        return None
-    distance = np.linalg.norm(offsets, axis=1)
-    size = distance.mean()
-    tangential = offsets - np.outer(offsets @ normal, normal)
-    # Far nodes are dear: a weight is measured times its distance.
-    conditions = np.concatenate([np.ones((1, len(offsets))), tangential.T / size]) * size / distance
-    if np.linalg.svd(conditions, compute_uv=False)[d - 1] < 0.1:
-        return None
-    target = np.eye(d + 1)[0]
-    return size / distance * np.linalg.lstsq(conditions, target, rcond=1e-8)[0]
-
-
 def _check_pairs(system: System) -> None:
-    """Check that every contact pair is one node against a rigid obstacle, and concrete."""
-    if isinstance(system.points, Tracer) or isinstance(system.normals.weights, Tracer):
-        raise ValueError(
-            "RedistributedMass moves mass on the host and needs concrete node positions and "
-            "contact normals; to differentiate by shape or obstacle use jc.ContactStabilized()"
-        )
+    """Check that every contact pair is one node against a rigid obstacle."""
     d, nodes = system.dimension, np.asarray(system.contact_nodes)
     if system.size != d * len(system.free_nodes) or system.normals.unknowns.shape[1] != d:
         raise ValueError(

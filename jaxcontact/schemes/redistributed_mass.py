@@ -49,8 +49,8 @@ class RedistributedMass:
     """Newmark on a body whose contact nodes have no mass in contact direction.
 
     Trapezoidal rule inside; the contact row is the static balance (A y' + B w - f) . nu + c' = 0 at
-    the new time. The velocity of a contact node is extrapolated from d + 1 or more nodes inside,
-    exactly for affine fields, so total mass, centre of mass and inertia are those of the body.
+    the new time. Its mass moves to the nodes just inside; total mass, centre of mass and inertia
+    stay those of the body (`schemes/mass_redistribution.py`).
 
     Order 2 without contact and viscosity. The contact force does not chatter, since no mass
     can bounce, and it is the best of all schemes. Energy is kept up to the ledger's numerical loss
@@ -64,8 +64,7 @@ class RedistributedMass:
     neighbours.
 
     Source: Khenous, Laborde, Renard, Eur. J. Mech. A/Solids 27 (2008) 918-932; Hager, Hueeber,
-    Wohlmuth, Int. J. Numer. Meth. Engng 73 (2008) 1206-1225. Theirs are quadrature weights and
-    a fitted matrix; extrapolation keeps the same moments and gives a positive semidefinite M_r.
+    Wohlmuth, Int. J. Numer. Meth. Engng 73 (2008) 1206-1225.
     """
 
     def prepare(
@@ -74,8 +73,8 @@ class RedistributedMass:
         """Return the operators: M_r, and D factorised once.
 
         Raises:
-            ValueError: if the contact pairs are not one per node, the node positions are traced,
-                or a contact node has too few nodes inside the body near it.
+            ValueError: if the contact pairs are not one per node, or the mesh is too coarse to
+                move the mass of the contact nodes inside.
         """
         d, n_nodes = system.dimension, len(system.free_nodes)
         if system.normals.count == 0:

@@ -1,0 +1,111 @@
+"""The adjoint of one contact step: the VI as a `jax.custom_vjp`.
+
+With the active set A of the step and the saddle-point matrix of `saddle_point.py`, which is
+symmetric, the transpose of (dr, db) -> (dw, dp) is the same problem,
+
+    D r* + N^T b* = w*,    (N r* - s b*)_i = p*_i on A,    b*_i = 0 elsewhere,
+
+one step of (4.40)-(4.41). The cotangents of D and N follow on their sparsity patterns,
+
+    D* = -r* w^T,    N* = -(p r*^T + b* w^T).
+
+The iteration of the solver is never differentiated. A step keeps one boolean per contact pair;
+w and p are kept only if the matrix or the normals are differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+from jax import Array
+from jax.custom_derivatives import custom_vjp_primal_tree_values
+
+from jaxcontact.contact.complementarity import Solution
+from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
+from jaxcontact.contact.tangent import instantiate, linear_contact, solve_forward
+from jaxcontact.contact.weak import Strong
+from jaxcontact.symmetric_product import outer_on_pattern
+
+
+class Residuals(NamedTuple):
+    """What a step keeps for its backward pass; None where nothing asks for it."""
+
+    pairs: Array
+    """A, (C,) bool: all that the gradient by loads, states, gaps and bounds needs."""
+
+    softness: Array | None
+    """dg/dp of a relaxed contact law, (C,)."""
+
+    velocity: Array | None
+    """w, (n,), if matrix or normals are differentiated."""
+
+    multiplier: Array | None
+    """p, (C,), if the normals are differentiated."""
+
+    values: Array
+    """Entries of D (the same in every step, stored once)."""
+
+    weights: Array
+    """Entries of N (the same in every step, stored once)."""
+
+    fixed: Fixed
+    """Patterns and the factor (the same in every step, stored once)."""
+
+
+#: Algorithm 1 of the paper: the whole active set counts as strong contact.
+ALGORITHM_1 = Strong()
+
+
+@jax.custom_vjp
+def solve_with_adjoint(
+    values: Array, weights: Array, rhs: Array, bound: Array, fixed: Fixed
+) -> tuple[Array, Solution]:
+    """Solve the VI; see `ContactProblem.solve`."""
+    return solve_forward(ALGORITHM_1, values, weights, rhs, bound, fixed)
+
+
+# Invariant: the backward pass solves the transpose of the linear problem that `solve_forward` has
+# as its forward-mode rule, with the same pairs. Both call `solve_on_cone`.
+def _solve_fwd(*arguments):
+    values, weights, rhs, bound, fixed = custom_vjp_primal_tree_values(arguments)
+    is_matrix_asked, is_normals_asked = arguments[0].perturbed, arguments[1].perturbed
+    w, solution = solve_forward(ALGORITHM_1, values, weights, rhs, bound, fixed)
+    pairs, softness = linear_contact(ALGORITHM_1, weights, bound, fixed, w, solution)
+    residuals = Residuals(
+        pairs=pairs,
+        softness=softness,
+        velocity=w if is_matrix_asked or is_normals_asked else None,
+        multiplier=solution.multiplier if is_normals_asked else None,
+        values=values,
+        weights=weights,
+        # What changes from step to step and is not needed again.
+        fixed=fixed._replace(guess=None, resolution=None),
+    )
+    return (w, solution), residuals
+
+
+def _solve_bwd(residuals, cotangents):
+    w_bar, solution_bar = cotangents
+    pairs, softness, velocity, multiplier, values, weights, fixed = residuals
+    rhs_bar, bound_bar = solve_on_cone(
+        values,
+        weights,
+        fixed,
+        pairs,
+        softness,
+        instantiate(w_bar),
+        instantiate(solution_bar.multiplier),
+    )
+    values_bar = weights_bar = None
+    if velocity is not None:
+        values_bar = -outer_on_pattern(fixed.columns, rhs_bar, velocity)
+    if velocity is not None and multiplier is not None:
+        weights_bar = -(
+            multiplier[:, None] * rhs_bar[fixed.unknowns]
+            + bound_bar[:, None] * velocity[fixed.unknowns]
+        )
+    return values_bar, weights_bar, rhs_bar, bound_bar, None
+
+
+solve_with_adjoint.defvjp(_solve_fwd, _solve_bwd, symbolic_zeros=True)
