@@ -1,10 +1,10 @@
 """The free bar against a wall, computed with GetFEM; a program of its own, run by its Python.
 
 Reads a JSON record {n, length, young, density, gap, speed, dt, steps, scheme} from the standard
-input and writes {displacement, impulse, seconds} to the file named as argument. GetFEM assembles the
-matrices and solves the contact problem of every step (its basic contact brick, its Newton method and
-MUMPS); the schemes are those of `jaxcontact`, written in terms of the new displacement. Needs NumPy
-and GetFEM only.
+input and writes {displacement, impulse, seconds} to the file named as argument. GetFEM assembles
+the matrices and solves the contact problem of every step (its basic contact brick, its Newton
+method and MUMPS); the schemes are those of `jaxcontact`, written in terms of the new displacement.
+Needs NumPy and GetFEM only.
 """
 
 import json

@@ -1,9 +1,9 @@
 """Where is a scheme stable, and where is its contact force smooth?
 
-The free bar hits a wall (`bars.free_bar`): Courant number c dt/h by viscosity eta/(rho c L), one map
-for each scheme; the worst of some phases of the impact inside a step. Upper row: the largest energy
-over that at the start. Lower row: standard deviation of the contact force in the middle of the contact,
-where the exact force of the elastic bar is constant, over that force.
+The free bar hits a wall (`bars.free_bar`): Courant number c dt/h by viscosity eta/(rho c L), one
+map for each scheme. Upper row: the largest energy over that at the start, the worst of some phases
+of the impact inside a step. Lower row: standard deviation of the contact force in the middle of the
+contact, where the exact force of the elastic bar is constant, over that force; mean over phases.
 """
 
 from __future__ import annotations

@@ -20,8 +20,6 @@ import numpy as np
 import scipy.sparse
 from jax import Array
 
-from jaxcontact.sparse import SymmetricMatrix
-
 
 class NodePattern(NamedTuple):
     """Sparsity of a matrix on the selected nodes of a mesh, in padded ELL layout (host arrays)."""
@@ -76,8 +74,8 @@ def assemble(pattern: NodePattern, blocks: Array) -> Array:
     width, n = pattern.columns.shape
     n_components = blocks.shape[-1]
     # An out-of-bounds slot is dropped; -1 would wrap around to the last one.
-    slots = np.where(pattern.slots < 0, width, pattern.slots)
-    rows = np.broadcast_to(pattern.rows[:, :, None], slots.shape)
+    slots = jnp.where(pattern.slots < 0, width, pattern.slots)
+    rows = jnp.broadcast_to(pattern.rows[:, :, None], slots.shape)
     values = jnp.zeros((width, n, n_components, n_components), blocks.dtype)
     values = values.at[slots, rows].add(blocks, mode="drop")  # (slot, row, i, j)
     values = values.transpose(0, 3, 1, 2)  # (slot, j, row, i)
@@ -136,11 +134,6 @@ def stiffness_blocks(gradients: Array, volumes: Array, lame: tuple) -> Array:
     return first[:, None, None, None, None] * outer + second[:, None, None, None, None] * isotropic
 
 
-def scalar_matrix(pattern: NodePattern, blocks: Array) -> SymmetricMatrix:
-    """Return the matrix of scalar element blocks (E, d+1, d+1, 1, 1) on the selected nodes."""
-    return SymmetricMatrix(assemble(pattern, blocks), pattern.columns)
-
-
 def nodal_areas(points: Array, facets: np.ndarray) -> Array:
     """Return the integral of each hat function over a facet set, (N,) [m^(d-1)] (1D: one)."""
     corners = points[facets]
@@ -152,4 +145,4 @@ def nodal_areas(points: Array, facets: np.ndarray) -> Array:
         gram = jnp.einsum("fai,fbi->fab", edges, edges)
         areas = jnp.sqrt(jnp.linalg.det(gram)) / float(np.prod(np.arange(1, dimension)))
     shares = jnp.repeat(areas / dimension, dimension)
-    return jnp.zeros(points.shape[0], points.dtype).at[np.ravel(facets)].add(shares)
+    return jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(facets)].add(shares)

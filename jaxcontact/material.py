@@ -55,7 +55,7 @@ class KelvinVoigt:
     def is_elastic(self) -> bool:
         """Return True if both viscosities are known to be zero (a traced viscosity is not)."""
         return all(
-            not isinstance(viscosity, Tracer) and not np.any(viscosity)
+            not isinstance(viscosity, Tracer) and not np.any(np.asarray(viscosity))
             for viscosity in (self.bulk_viscosity, self.shear_viscosity)
         )
 

@@ -88,7 +88,7 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
             radius that defines no surface.
     """
     check_obstacle(obstacle, points.shape[1])
-    gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
+    gap, gradient = _distance_and_gradient(obstacle, points)
     length = jnp.linalg.norm(gradient, axis=1, keepdims=True)
     if not isinstance(length, Tracer) and not np.all(np.asarray(length) > 0.0):
         raise ValueError(
@@ -96,6 +96,11 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
             "at a contact node, so no contact normal exists there; is a node at the centre?"
         )
     return gap, -gradient / length
+
+
+@jax.jit
+def _distance_and_gradient(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
+    return jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
 
 
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
@@ -116,8 +121,9 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
             continue
         if not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"{where} must be finite, got {value}")
-        if name == "normal" and not np.any(value):
+        # np.asarray first: under jit the methods of a concrete JAX array give tracers.
+        if name == "normal" and not np.any(np.asarray(value)):
             raise ValueError(f"{where} must not be the zero vector")
     radius = getattr(obstacle, "radius", None)
-    if radius is not None and not isinstance(radius, Tracer) and not radius > 0.0:
+    if radius is not None and not isinstance(radius, Tracer) and not np.asarray(radius) > 0.0:
         raise ValueError(f"Ball.radius must be positive, got {radius}")

@@ -78,6 +78,8 @@ def simulate(
             f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
         )
     initial = _check_initial(stepper, initial)
+    if control is not None:
+        control = jnp.asarray(control, stepper.system.dtype)
     trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
@@ -219,7 +221,7 @@ def _check_initial(stepper: Stepper, initial: State | None) -> State:
     shape = (system.n_nodes, system.dimension)
     if initial is None:
         rest = jnp.zeros(shape, system.dtype)
-        return State(rest, rest)
+        initial = State(rest, rest)
     for name in ("displacement", "velocity"):
         value = getattr(initial, name)
         if np.shape(value) != shape:

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton, Status
+from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton, Solution, Status
 from jaxcontact.linear import Dense, LinearSolver
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.simulate import SolveError
@@ -86,13 +86,8 @@ def solve_static(
         coordinates = np.repeat(nodes, system.dimension, axis=0)
     factor = linear_solver.factorize(matrix, normals, coordinates)
     problem = ContactProblem(system.stiffness, system.normals, factor, solver)
-    y, solution = problem.solve(
-        system.load,
-        bound=system.gap,
-        resolution=gap_resolution(system, jnp.zeros_like(system.load)),
-        guess=system.gap < 0.0,
-    )
-    _check(y, solution.status)
+    y, solution = _solve(system, problem)
+    _check(solution.status)
     return StaticContact(
         displacement=system.lift(y),
         contact_force=solution.multiplier,
@@ -103,7 +98,18 @@ def solve_static(
     )
 
 
-def _check(y: Array, status: Array) -> None:
+@jax.jit
+def _solve(system: System, problem: ContactProblem) -> tuple[Array, Solution]:
+    """Return the unknowns (n,) of the equilibrium and the solution on the contact pairs."""
+    return problem.solve(
+        system.load,
+        bound=system.gap,
+        resolution=gap_resolution(system, jnp.zeros_like(system.load)),
+        guess=system.gap < 0.0,
+    )
+
+
+def _check(status: Array) -> None:
     if isinstance(status, Tracer):
         return
     if int(status) == Status.NON_FINITE:

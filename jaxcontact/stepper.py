@@ -50,6 +50,14 @@ class Stepper:
         )
 
 
+#: What to write where a name was given for an option.
+EXAMPLES = {
+    "scheme": "ContactImplicit",
+    "linear_solver": "NestedDissection",
+    "contact_solver": "SemismoothNewton",
+}
+
+
 def prepare(
     system: System,
     dt: float | Array,
@@ -88,8 +96,9 @@ def prepare(
         ("contact_solver", contact_solver),
     ):
         if isinstance(option, type | str):
-            raise ValueError(f"{name} must be an object, such as jc.{scheme}(), got {option!r}")
-    if not isinstance(dt, Tracer) and not (np.isfinite(dt) and dt > 0.0):
+            example = option.__name__ if isinstance(option, type) else EXAMPLES[name]
+            raise ValueError(f"{name} must be an object, such as jc.{example}(), got {option!r}")
+    if not isinstance(dt, Tracer) and not (np.isfinite(dt) and np.asarray(dt) > 0.0):
         raise ValueError(f"dt must be a positive number of seconds, got {dt}")
     if isinstance(system.mass.columns, Tracer):
         raise ValueError(

@@ -8,6 +8,8 @@ on the n unknowns: the displacement components of the nodes that are not clamped
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact import assembly
+from jaxcontact.material import KelvinVoigt
 from jaxcontact.obstacle import gap_and_normals
 from jaxcontact.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
@@ -147,41 +150,91 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
     numbers = np.where(is_free, np.cumsum(is_free) - 1, -1)
 
-    gradients, volumes = assembly.hat_gradients(points, cells)
-    l2_blocks = assembly.mass_blocks(volumes, dimension)
-    material = cellwise_material(scene)
-    density = jnp.broadcast_to(jnp.asarray(material.density, dtype), volumes.shape)
     pattern = assembly.node_pattern(cells, numbers)
-    columns = assembly.matrix_columns(pattern, dimension)
-
-    def vector_mass(blocks: Array) -> SymmetricMatrix:
-        scalar = assembly.assemble(pattern, blocks)
-        return SymmetricMatrix(assembly.repeat_scalar(scalar, dimension), columns)
-
-    def isotropic(lame: tuple) -> SymmetricMatrix:
-        blocks = assembly.stiffness_blocks(gradients, volumes, lame)
-        return SymmetricMatrix(assembly.assemble(pattern, blocks), columns)
-
     all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
+    columns = assembly.matrix_columns(pattern, dimension)
+    values = _assemble(
+        points,
+        cells,
+        cellwise_material(scene),
+        pattern,
+        all_nodes,
+        None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
+        {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
+        is_elastic=is_elastic(scene),
+    )
     nodes, gap, vectors, area = _contact_pairs(scene, points)
     components = np.arange(dimension, dtype=np.int32)
     unknowns = numbers[nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
     return System(
-        mass=vector_mass(density[:, None, None, None, None] * l2_blocks),
-        stiffness=isotropic(material.elastic_lame()),
-        viscosity=None if is_elastic(scene) else isotropic(material.viscous_lame()),
-        l2_mass=vector_mass(l2_blocks),
-        nodal_mass=assembly.scalar_matrix(all_nodes, l2_blocks),
+        mass=SymmetricMatrix(values.mass, columns),
+        stiffness=SymmetricMatrix(values.stiffness, columns),
+        viscosity=None if values.viscosity is None else SymmetricMatrix(values.viscosity, columns),
+        l2_mass=SymmetricMatrix(values.l2_mass, columns),
+        nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
         normals=ContactNormals(vectors, unknowns),
         gap=gap,
-        load=_constant_load(scene, points, volumes)[free_nodes].reshape(-1),
+        load=values.load[free_nodes].reshape(-1),
         contact_nodes=nodes,
         contact_area=area,
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
         dimension=dimension,
+    )
+
+
+class _Values(NamedTuple):
+    """Entries of the matrices in ELL layout, and the nodal load (N, d)."""
+
+    mass: Array
+    stiffness: Array
+    viscosity: Array | None
+    l2_mass: Array
+    nodal_mass: Array
+    load: Array
+
+
+# One program for all of it: compiling operation by operation takes seconds for every new mesh.
+@partial(jax.jit, static_argnames="is_elastic")
+def _assemble(
+    points: Array,
+    cells: Array,
+    material: KelvinVoigt,
+    pattern: assembly.NodePattern,
+    all_nodes: assembly.NodePattern,
+    body_force: Array | None,
+    tractions: dict[str, tuple[Array, Array]],
+    *,
+    is_elastic: bool,
+) -> _Values:
+    dimension = points.shape[1]
+    gradients, volumes = assembly.hat_gradients(points, cells)
+    l2_blocks = assembly.mass_blocks(volumes, dimension)
+    density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
+
+    def vector_mass(blocks: Array) -> Array:
+        return assembly.repeat_scalar(assembly.assemble(pattern, blocks), dimension)
+
+    def isotropic(lame: tuple) -> Array:
+        blocks = assembly.stiffness_blocks(gradients, volumes, lame)
+        return assembly.assemble(pattern, blocks)
+
+    load = jnp.zeros(points.shape, points.dtype)
+    if body_force is not None:
+        shares = jnp.repeat(volumes / (dimension + 1), dimension + 1)
+        weights = jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(cells)].add(shares)
+        load = load + weights[:, None] * body_force[None, :]
+    for facets, traction in tractions.values():
+        load = load + assembly.nodal_areas(points, facets)[:, None] * traction[None, :]
+    return _Values(
+        mass=vector_mass(density[:, None, None, None, None] * l2_blocks),
+        stiffness=isotropic(material.elastic_lame()),
+        viscosity=None if is_elastic else isotropic(material.viscous_lame()),
+        l2_mass=vector_mass(l2_blocks),
+        nodal_mass=assembly.assemble(all_nodes, l2_blocks),
+        load=load,
     )
 
 
@@ -198,10 +251,15 @@ def _check_dtype(dtype) -> None:
 def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Array, Array]:
     """Return node (C,), gap (C,), normal (C, d) and area (C,) of every contact pair."""
     nodes, gaps, normals, areas = [], [], [], []
+    # Sets with one obstacle are one set: a node that is in both must not get the same pair twice.
+    sets: dict[int, list[str]] = {}
     for name in sorted(scene.contact):
-        facets = np.asarray(scene.mesh.facets[name])
+        sets.setdefault(id(scene.contact[name]), []).append(name)
+    for names in sets.values():
+        facets = np.concatenate([scene.mesh.facets[name] for name in names])
+        facets = np.unique(facets, axis=0)
         set_nodes = np.unique(facets)
-        gap, vectors = gap_and_normals(scene.contact[name], points[set_nodes])
+        gap, vectors = gap_and_normals(scene.contact[names[0]], points[set_nodes])
         nodes.append(set_nodes)
         gaps.append(gap)
         normals.append(vectors)
@@ -220,21 +278,6 @@ def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Arra
         jnp.concatenate(normals),
         jnp.concatenate(areas),
     )
-
-
-def _constant_load(scene: Scene, points: Array, volumes: Array) -> Array:
-    """Return the consistent nodal forces of body force and tractions, (N, d) [N]."""
-    load = jnp.zeros(points.shape, points.dtype)
-    if scene.body_force is not None:
-        n_local = scene.mesh.dimension + 1
-        shares = jnp.repeat(volumes / n_local, n_local)
-        weights = jnp.zeros(points.shape[0], points.dtype)
-        weights = weights.at[np.ravel(scene.mesh.cells)].add(shares)
-        load = load + weights[:, None] * jnp.asarray(scene.body_force, points.dtype)[None, :]
-    for name, traction in scene.traction.items():
-        weights = assembly.nodal_areas(points, np.asarray(scene.mesh.facets[name]))
-        load = load + weights[:, None] * jnp.asarray(traction, points.dtype)[None, :]
-    return load
 
 
 def _free_components(system: System, y: Array) -> Array:

@@ -24,7 +24,7 @@ LAYERS = (
     {"trajectory"},
     {"time_loop"},
     {"simulate"},
-    {"energy", "inner_product", "pressure", "static"},
+    {"energy", "inner_product", "memory", "pressure", "static"},
     {"cost"},
     {"scenes", "optimize", "derivative"},
     {"axes"},

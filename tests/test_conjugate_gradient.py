@@ -1,5 +1,8 @@
 """Claims about conjugate gradients: the same motion and derivatives as the dense solver."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,8 +26,12 @@ def make_system(dtype=jnp.float64):
 
 
 SYSTEM = make_system()
-SOLVERS = {"dense": jc.Dense(), "cg": jc.ConjugateGradient()}
+SOLVERS: dict[str, Any] = {"dense": jc.Dense(), "cg": jc.ConjugateGradient()}
 STEPPERS = {name: jc.prepare(SYSTEM, DT, linear_solver=solver) for name, solver in SOLVERS.items()}
+
+
+def iterate(**options) -> Any:
+    return jc.ConjugateGradient(**options)
 
 
 def throw(system):
@@ -102,7 +109,7 @@ def test_conjugate_gradient_holds_a_fixed_active_set():
 
 
 def residual_of_a_solve(tolerance):
-    stepper = jc.prepare(SYSTEM, DT, linear_solver=jc.ConjugateGradient(tolerance=tolerance))
+    stepper = jc.prepare(SYSTEM, DT, linear_solver=iterate(tolerance=tolerance))
     factor = stepper.operators.problem.factor
     rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
     residual = rhs - factor.matrix @ factor.solve(rhs)
@@ -123,26 +130,16 @@ def test_conjugate_gradient_refuses_contact_sets_that_share_a_node():
     material = jc.KelvinVoigt(young=1.0, poisson=0.3)
     system = jc.discretize(jc.Scene(mesh, material, contact={"bottom": plane, "left": wall}))
     with pytest.raises(ValueError, match="common nodes"):
-        jc.prepare(system, DT, linear_solver=jc.ConjugateGradient())
+        jc.prepare(system, DT, linear_solver=iterate())
 
 
 def exhausted():
     stepper = STEPPERS["cg"]
-    short = jc.ConjugateGradient(max_iterations=3)
+    short = iterate(max_iterations=3)
     # prepare would refuse this solver at once, so the failure is put where values decide it.
     factor = short.factorize(stepper.operators.problem.matrix, SYSTEM.normals)
-    operators = stepper.operators
-    problem = type(operators.problem)(
-        operators.problem.matrix, SYSTEM.normals, factor, stepper.contact_solver
-    )
-    return jc.Stepper(
-        SYSTEM,
-        stepper.dt,
-        type(operators)(operators.mass, problem),
-        stepper.scheme,
-        short,
-        stepper.contact_solver,
-    )
+    problem = replace(stepper.operators.problem, factor=factor)
+    return replace(stepper, operators=replace(stepper.operators, problem=problem))
 
 
 def test_conjugate_gradient_out_of_iterations_is_an_error():
@@ -159,12 +156,12 @@ def test_conjugate_gradient_out_of_iterations_is_non_finite_under_jit():
 
 def test_conjugate_gradient_out_of_iterations_is_refused_by_prepare():
     with pytest.raises(ValueError, match="positive definite"):
-        jc.prepare(SYSTEM, DT, linear_solver=jc.ConjugateGradient(max_iterations=3))
+        jc.prepare(SYSTEM, DT, linear_solver=iterate(max_iterations=3))
 
 
 def test_conjugate_gradient_works_in_float32():
     system = make_system(jnp.float32)
-    stepper = jc.prepare(system, DT, linear_solver=jc.ConjugateGradient())
+    stepper = jc.prepare(system, DT, linear_solver=iterate())
     single = jc.simulate(stepper, control(system), initial=throw(system))
     double = jc.simulate(STEPPERS["dense"], control(), initial=throw(SYSTEM))
     assert single.displacement.dtype == jnp.float32

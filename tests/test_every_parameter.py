@@ -34,8 +34,9 @@ def check_every_parameter(dimension, scheme, obstacle):
         name = jax.tree_util.keystr(path)
         size = max(float(jnp.max(jnp.abs(leaf))), 1e-2)
         direction = jnp.asarray(size * rng.choice([-1.0, 1.0], size=leaf.shape))
-        if name == "['points']":
-            direction = 0.1 * direction
+        if name in ("['points']", "['obstacle']['center']", "['obstacle']['radius']"):
+            # Lengths, to be compared with the gap and not with the size of the body.
+            direction = 0.02 * direction
 
         def at(h, i=i, direction=direction):
             return float(

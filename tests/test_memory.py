@@ -32,6 +32,7 @@ def throw(system):
 
 def compiled_bytes(function, *arguments, without=0):
     analysis = jax.jit(function).lower(*arguments).compile().memory_analysis()
+    assert analysis is not None
     sizes = analysis.argument_size_in_bytes, analysis.output_size_in_bytes
     return sum(sizes) + analysis.temp_size_in_bytes - without
 

@@ -283,9 +283,6 @@ def test_simulate_into_a_corner_touches_both_obstacles():
     assert kkt_violation(system, DT, motion) < KKT_TOLERANCE
 
 
-@pytest.mark.xfail(
-    strict=True, raises=jc.SolveError, reason="two equal rows of N make the compliance singular"
-)
 def test_simulate_survives_two_contact_sets_that_share_a_node_and_an_obstacle():
     plane = jc.HalfSpace(np.array([-0.1, -0.1]), np.array([1.0, 1.0]))
     system = jc.discretize(corner_scene(plane, plane))

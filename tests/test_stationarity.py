@@ -33,6 +33,18 @@ def test_stationarity_at_the_kinked_minimiser_holds_with_the_multipliers_by_hand
     assert "0 with a wrong sign" in str(certificate)
 
 
+def test_stationarity_counts_a_tiny_impulse_as_weak_contact():
+    problem = grazing()
+    u = 1.00001 * minimizer(problem)
+    assert float(problem.simulate(u).contact_impulse[-1, 0]) > 0.0
+    certificate = jc.stationarity(problem.objective, u, **problem.options)
+    nu, pi = multipliers(problem)
+    # The control is off by a relative 1e-5, and so are its multipliers in their common share.
+    np.testing.assert_allclose(certificate.gap_multiplier, [nu], rtol=1e-4)
+    np.testing.assert_allclose(certificate.impulse_multiplier, [pi], rtol=1e-4)
+    assert certificate.residual < 1e-4 * certificate.gradient_norm
+
+
 def test_stationarity_reports_the_wrong_sign_where_release_is_better():
     # A target before the wall: at grazing it would pay to stay away.
     problem = grazing(target=0.05)

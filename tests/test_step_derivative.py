@@ -228,9 +228,6 @@ def test_step_that_is_not_solved_poisons_value_and_gradient():
         assert np.any(np.isnan(gradient))
 
 
-@pytest.mark.xfail(
-    strict=True, reason="only the velocity is multiplied by NaN; the multiplier looks like a result"
-)
 def test_step_that_is_not_solved_poisons_its_multiplier():
     data = random_data()
     solver = jc.ProjectedGaussSeidel(max_sweeps=1)

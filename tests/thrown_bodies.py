@@ -93,14 +93,18 @@ def cost(trajectory):
 
 @cache
 def compiled(dimension, scheme=None, obstacle="plane", fixed=()):
-    """Values, cost and its gradient by all values but the fixed ones, under jit"""
+    """Values, cost and its gradient by all values but the fixed ones
+
+    Under jit, where also the fixed values would be traced, only if there are none.
+    """
     values = parameters(dimension, obstacle)
     still = {name: values.pop(name) for name in fixed}
 
     def value(values):
         return cost(motion(dimension, values | still, scheme))
 
-    return values, jax.jit(value), jax.jit(jax.grad(value))(values)
+    compile_ = (lambda f: f) if fixed else jax.jit
+    return values, compile_(value), compile_(jax.grad(value))(values)
 
 
 def grazing(dimension, scheme=None):

@@ -10,7 +10,6 @@ derivative. Source: Theorem 4.20.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -22,14 +21,14 @@ from jax.custom_derivatives import SymbolicZero
 from jaxcontact.contact import critical_cone, matrix_free
 from jaxcontact.contact.complementarity import ContactSolver, Solution
 from jaxcontact.contact.forward_only import forward_only
+from jaxcontact.contact.lasting_jvp import lasting_jvp
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.weak import CriticalCone, OnBranch, WeakContact
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def solve_forward(
+def _solve_forward(
     weak_contact: WeakContact,
     values: Array,
     weights: Array,
@@ -54,8 +53,9 @@ def solve_forward(
     return factor.expand(partial_sweep, solution.multiplier), solution
 
 
-@partial(solve_forward.defjvp, symbolic_zeros=True)
-def _solve_forward_jvp(weak_contact, primals, tangents):
+def _solve_forward_jvp(arguments, tangents):
+    weak_contact, *primals = arguments
+    _, *tangents = tangents
     values, weights, _, bound, fixed = primals
     if isinstance(weak_contact, OnBranch) and _is_exact(fixed.contact_solver, bound):
         # AlongDirection moves loads and states, neither matrices nor normals.
@@ -71,6 +71,10 @@ def _solve_forward_jvp(weak_contact, primals, tangents):
         pairs, softness = linear_contact(weak_contact, weights, bound, fixed, w, solution)
         w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, softness, *data_dot)
     return (w, solution), (w_dot, _tangent(solution, p_dot))
+
+
+#: The VI of a step with its derivative, of every order and in any order of transformations.
+solve_forward = lasting_jvp(_solve_forward, _solve_forward_jvp)
 
 
 def linear_contact(
@@ -125,8 +129,7 @@ def _solve_critical_cone(
     return critical_cone.solve(solve_on_set, strong, weak, compliance)
 
 
-@jax.custom_jvp
-def _solve_on_branch(values, weights, rhs, bound, fixed, direction):
+def _solve_branch(values, weights, rhs, bound, fixed, direction):
     """Solve the VI and its one-sided derivative along (dr, db).
 
     Derivative: linear, on the pairs that the direction keeps in contact; the one-sided derivative
@@ -137,8 +140,7 @@ def _solve_on_branch(values, weights, rhs, bound, fixed, direction):
     return (w, solution), derivative
 
 
-@partial(_solve_on_branch.defjvp, symbolic_zeros=True)
-def _solve_on_branch_jvp(primals, tangents):
+def _solve_branch_jvp(primals, tangents):
     values, weights, _, _, fixed, _ = primals
     (w, solution), derivative = _solve_on_branch(*primals)
     pairs = solution.active & ((solution.multiplier > 0.0) | (derivative[1] > 0.0))
@@ -146,6 +148,9 @@ def _solve_on_branch_jvp(primals, tangents):
     w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, None, *data_dot)
     constant = jax.tree.map(jnp.zeros_like, derivative)
     return ((w, solution), derivative), ((w_dot, _tangent(solution, p_dot)), constant)
+
+
+_solve_on_branch = lasting_jvp(_solve_branch, _solve_branch_jvp)
 
 
 def _is_exact(contact_solver: ContactSolver, pairs: Array) -> bool:

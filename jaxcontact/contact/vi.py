@@ -91,8 +91,8 @@ class ContactProblem:
         else:
             velocity, solution = solve_forward(self.weak_contact, *data)
         # Multiplication poisons value and gradient alike; a `where` would leave a zero gradient.
-        poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan)
-        return velocity * poison.astype(velocity.dtype), solution
+        poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(velocity.dtype)
+        return velocity * poison, solution._replace(multiplier=solution.multiplier * poison)
 
 
 def _solve_linear(problem: ContactProblem, rhs: Array) -> Array:

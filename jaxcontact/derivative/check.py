@@ -95,6 +95,7 @@ class GradientCheck:
         return f"{self.central_relative_error[i]:.1e} relative"
 
 
+@np.errstate(invalid="ignore", over="ignore")  # a NaN is a finding, not a warning
 def check_gradient(
     objective: Callable[[Any], Array],
     u: Any,

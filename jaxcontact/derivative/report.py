@@ -89,9 +89,7 @@ class DerivativeReport:
         if self.is_differentiable:
             lines.append("The gradient is the derivative.")
         elif self.has_right_signs:
-            lines.append(
-                "One-sided derivatives only; every kink is a valley (signs as at a minimum)."
-            )
+            lines.append("One-sided derivatives only; every kink is a valley, as at a minimum.")
         else:
             lines.append("One-sided derivatives only, and some kink is not a valley.")
         return "\n".join(lines)

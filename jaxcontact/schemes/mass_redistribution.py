@@ -96,7 +96,8 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
     tangential = xp.where(is_donor[:, :, None], tangential, 0.0)
     distances = xp.where(is_donor, squares / size, 1.0)
     matrix = OFFSET_PENALTY * tangential @ xp.swapaxes(tangential, 1, 2) / size[:, :, None]
-    matrix = matrix + distances[:, :, None] * np.eye(is_donor.shape[1], dtype=distances.dtype)
+    identity = np.eye(is_donor.shape[1], dtype=distances.dtype)
+    matrix = matrix + distances[:, :, None] * identity[None]
     ones = is_donor.astype(distances.dtype)
     raw = xp.linalg.solve(matrix, ones[:, :, None])[:, :, 0] * ones
     return raw / xp.sum(raw, axis=1)[:, None]
@@ -122,7 +123,7 @@ def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     equations = equations.transpose(0, 2, 1, 3).reshape(k * k, k * k)
     xp = _numpy_of(fields, missing)
     T = (xp.linalg.pinv(equations, hermitian=True) @ missing.reshape(-1)).reshape(k, k)
-    blocks = volumes[:, None, None] * (rigid @ (0.5 * (T + T.T)) @ rigid.swapaxes(1, 2))
+    blocks = volumes[:, None, None] * (rigid @ (0.5 * (T + T.T))[None] @ rigid.swapaxes(1, 2))
     return BlockMatrix(inside, inside, blocks)
 
 
