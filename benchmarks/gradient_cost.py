@@ -159,7 +159,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
     options = measure.parse(arguments, argv)
     if options.quick:
-        options.sizes, options.steps = [100], [16]
+        options.sizes, options.steps, options.solver = [60], [16], "dense"
         options.kinds = ["control", "material, checkpoint", *KINDS[-2:]]
     rows = []
     for n in options.sizes:

@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments.add_argument("--fit-from", type=int, default=9_000, help="smallest n of the fit")
     options = measure.parse(arguments, argv)
     if options.quick:
-        options.shapes, options.sizes_2d, options.sizes_3d = ["delaunay", "box"], [80, 150], [80]
+        options.shapes, options.sizes_2d = ["delaunay"], [80, 150]
     rows = []
     for shape in options.shapes:
         for n in options.sizes_3d if shape == "box" else options.sizes_2d:

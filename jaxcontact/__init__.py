@@ -29,6 +29,7 @@ from jaxcontact.inner_product import l2_value_and_grad
 from jaxcontact.io import read_mesh
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.material import KelvinVoigt
+from jaxcontact.memory import MemoryEstimate, estimate_memory
 from jaxcontact.mesh import Mesh
 from jaxcontact.obstacle import Ball, HalfSpace, SignedDistance
 from jaxcontact.optimize import (
@@ -85,6 +86,7 @@ __all__ = [
     "Homotopy",
     "Inactive",
     "KelvinVoigt",
+    "MemoryEstimate",
     "Mesh",
     "NestedDissection",
     "NewtonCG",
@@ -117,6 +119,7 @@ __all__ = [
     "directional_derivative",
     "discretize",
     "energy",
+    "estimate_memory",
     "l2_value_and_grad",
     "load_result",
     "meshes",

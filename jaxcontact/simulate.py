@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxcontact.contact import AlongDirection, Status, WeakContact
 from jaxcontact.contact.branch import (
     along_direction,
+    check_weak_contact,
     float_leaves,
     tangent_of,
     with_weak_contact,
@@ -80,6 +81,7 @@ def simulate(
     initial = _check_initial(stepper, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
+    check_weak_contact(weak_contact)
     trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)

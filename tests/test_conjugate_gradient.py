@@ -79,6 +79,7 @@ def test_conjugate_gradient_gives_the_hessian_product_of_dense():
     assert_close(cg, dense)
 
 
+@pytest.mark.slow
 def test_conjugate_gradient_gives_the_material_gradient_of_dense():
     def by_stiffness(solver):
         def misfit(young):

@@ -19,13 +19,7 @@ from jaxcontact.contact.weak import AlongDirection, OnBranch, WeakContact
 
 
 def with_weak_contact(operators: Any, choice: WeakContact | AlongDirection) -> Any:
-    """Return the operators of a scheme with another treatment of weak contact.
-
-    Raises:
-        ValueError: if the choice is a class or a string instead of an object.
-    """
-    if isinstance(choice, type | str):
-        raise ValueError(f"weak_contact must be an object, such as jc.Strong(), got {choice!r}")
+    """Return the operators of a scheme with another treatment of weak contact."""
     if isinstance(choice, AlongDirection):
         choice = OnBranch()
 
@@ -37,6 +31,12 @@ def with_weak_contact(operators: Any, choice: WeakContact | AlongDirection) -> A
         operators,
         is_leaf=is_problem,
     )
+
+
+def check_weak_contact(choice: Any) -> None:
+    """Raise a ValueError if the choice is a class or a string instead of an object."""
+    if isinstance(choice, type | str):
+        raise ValueError(f"weak_contact must be an object, such as jc.Strong(), got {choice!r}")
 
 
 def along_direction(advance: Callable[[Any, Any], tuple[Any, Any]]) -> Callable:

@@ -17,6 +17,7 @@ from jaxcontact.contact.complementarity import (
     Status,
 )
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.sparse import ContactNormals
 
 
 def solve_contact(
@@ -55,7 +56,7 @@ def solve_contact(
     def advance(carry):
         active, _, _, _, steps = carry
         w, p = factor.solve_on_set(active, rhs, bound)
-        noise = resolution + RELATIVE_TOLERANCE[str(rhs.dtype)] * jnp.max(jnp.abs(normals @ w))
+        noise = resolution + RELATIVE_TOLERANCE[str(rhs.dtype)] * _magnitude(normals, w)
         stays = active & (compliance * p >= -noise)
         enters = ~active & (violation(w) > noise)
         following = stays | enters
@@ -65,7 +66,7 @@ def solve_contact(
     active, w, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
 
     relative_tolerance = RELATIVE_TOLERANCE[str(rhs.dtype)]
-    scale = jnp.max(jnp.abs(normals @ w)) + resolution / relative_tolerance
+    scale = _magnitude(normals, w) + resolution / relative_tolerance
     # Clipping a multiplier within the noise changes the balance of forces by as little.
     clipped = jnp.maximum(p, 0.0)
     error = jnp.abs(jnp.minimum(compliance * clipped, -violation(w)))
@@ -76,3 +77,8 @@ def solve_contact(
     status = jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32)
     is_closed = active | (-violation(w) <= relative_tolerance * scale)
     return w, Solution(clipped, is_closed, steps, status, residual)
+
+
+def _magnitude(normals: ContactNormals, w: Array) -> Array:
+    """Return the size of the terms of N w, a scalar: its rounding error is relative to it."""
+    return jnp.max(jnp.sum(jnp.abs(normals.weights * w[normals.unknowns]), axis=1))

@@ -46,7 +46,12 @@ def _solve_forward(
                 "another linear_solver, such as jc.NestedDissection()"
             )
         return matrix_free.solve_contact(
-            factor, contact_solver.max_steps, rhs, bound, fixed.resolution, fixed.guess
+            factor,
+            contact_solver.max_steps,  # type: ignore
+            rhs,
+            bound,
+            fixed.resolution,
+            fixed.guess,
         )
     partial_sweep, free = factor.condense(rhs)
     solution = contact_solver.solve(factor.compliance, bound - free, fixed.resolution, fixed.guess)
@@ -161,7 +166,7 @@ def _is_exact(contact_solver: ContactSolver, pairs: Array) -> bool:
 def instantiate(tangent: Any) -> Array:
     """Return a tangent or cotangent as an array, also if it is a symbolic zero."""
     if isinstance(tangent, SymbolicZero):
-        return jnp.zeros(tangent.shape, tangent.dtype)
+        return jnp.zeros(tangent.aval.shape, tangent.aval.dtype)  # type: ignore
     return tangent
 
 

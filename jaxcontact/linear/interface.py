@@ -45,12 +45,15 @@ class LinearSolver(Protocol):
         matrix: SymmetricMatrix,
         normals: ContactNormals,
         coordinates: np.ndarray | None = None,
-    ) -> Factor:
+    ) -> Any:
         """Factorise a matrix with concrete pattern and possibly traced values.
 
         Args:
             matrix: D, SPD, (n, n).
             normals: N, (C, n).
             coordinates: positions of the unknowns, (n, d), a hint for the ordering.
+
+        Returns:
+            A `Factor`, or an `IterativeFactor` that offers the same without a condensed compliance.
         """
         ...

@@ -90,6 +90,9 @@ class DissectionFactor:
     places: Array
     """Place of each unknown in the solution of all stages, root first, (n,) int32."""
 
+    origin: Array
+    """Zero, () int32; a number that the compiler cannot know."""
+
     is_positive: Array
     """True if D is positive definite, () bool; if not, all results contain NaN."""
 
@@ -161,6 +164,7 @@ class NestedDissection:
             contact_response=response,
             compliance=compliance,
             places=jnp.asarray(plan.places),
+            origin=jnp.zeros((), jnp.int32),
             is_positive=is_positive,
         )
 
@@ -204,8 +208,19 @@ def _sum_sources(update, sources):
     return total
 
 
+def _materialize(x, origin):
+    """Return x as a buffer of its own.
+
+    XLA fuses the producer of x, for a right-hand side some thirty scattered reads per entry, into
+    every gather of a sweep, and drops optimization barriers on CPUs. An update at an index that it
+    does not know stops that.
+    """
+    return jax.lax.dynamic_update_slice_in_dim(x, x[:1], origin, axis=0)
+
+
 def _up(factor, rhs) -> Partial:
     """Sweep from the leaves to the root."""
+    rhs = _materialize(rhs, factor.origin)
     values, update = [], None
     for stage in factor.stages:
         stage_values, updates = [], []

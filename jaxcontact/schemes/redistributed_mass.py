@@ -52,7 +52,8 @@ class RedistributedMass:
     the new time. Its mass moves to the nodes just inside; total mass, centre of mass and inertia
     stay those of the body (`schemes/mass_redistribution.py`).
 
-    Order 2 without contact and viscosity. The contact force does not chatter, since no mass
+    Order 2 without contact and viscosity, from an initial state that is in balance on the contact
+    rows (else an error of order tau h remains). The contact force does not chatter, since no mass
     can bounce, and it is the best of all schemes. Energy is kept up to the ledger's numerical loss
     tau^2/2 w_K . A w - tau/2 w_R . B (w - v)_K, of either sign and of order h, and the impact loss
     lam.(psi - N y)/tau.
