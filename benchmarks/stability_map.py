@@ -88,7 +88,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     options = measure.parse(measure.parser(__doc__), argv)
     courants = [1.0, 4.0] if options.quick else [0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 10.0]
     viscosities = [0.0] if options.quick else [0.0, 1e-4, 1e-3, 1e-2]
-    n, count = (20, 1) if options.quick else (100, 4)
+    n, count = (50, 2) if options.quick else (100, 4)
     rows = [
         rate(name, courant, viscosity, n, count)
         for name in SCHEMES

@@ -70,8 +70,9 @@ def simulate(
         SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
             the trajectory is NaN from that step on instead.
 
-    Derivative: forward and reverse mode of every order by control, initial state and every value
-    of the stepper; at weak contact the one that `weak_contact` names.
+    Derivative: reverse mode of every order by control, initial state and every value of the
+    stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
+    a `jax.custom_vjp`); at weak contact the derivative that it names.
     """
     steps = _check_steps(stepper, control, steps)
     if save_every < 1 or steps % save_every:

@@ -1,6 +1,9 @@
 """Exact gradients of every scheme: Taylor remainders of second order on bar and half disc."""
 
 import dataclasses
+import functools
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +11,10 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import bars
 
 SCHEMES = [
     jc.ContactImplicit(),
@@ -92,6 +99,45 @@ def test_scheme_gradient_on_the_half_disc_passes_the_taylor_test(scheme):
         return jnp.sum(jc.simulate(stepper, control).displacement ** 2)
 
     assert_taylor(objective, push, direction, [4e-5, 2e-5, 1e-5])
+
+
+@functools.cache
+def rebound_gradient_errors(scheme, n):
+    """Relative errors of d(mean final displacement)/d(impact speed) of P2, four phases"""
+    bar = bars.free_bar()
+    dt = bars.time_step(bar, n, 1.0)
+    stepper = jc.prepare(bars.discretize(bar, n), dt, scheme=scheme)
+    steps = round(bar.duration / dt)
+    x, t = jnp.linspace(0.0, 10.0, n + 1), jnp.asarray(steps * dt)
+
+    @jax.jit
+    @jax.grad
+    def slope(p, gap):
+        _, placed, initial = bars.place(bar, stepper, gap)
+        initial = jc.State(initial.displacement, p * initial.velocity)
+        return jnp.mean(jc.simulate(placed, steps=steps, initial=initial).final.displacement)
+
+    @jax.grad
+    def exact(p, gap):
+        thrown = dataclasses.replace(bar.exact, gap=gap, impact_speed=10.0 * p)
+        return jnp.mean(thrown.displacement(x, t))
+
+    gaps = [jnp.asarray(gap) for gap in bars.phases(bar, dt, 4)]
+    return np.array([float(slope(1.0, gap) / exact(1.0, gap)) - 1.0 for gap in gaps])
+
+
+def test_contact_implicit_gradient_of_a_rebound_does_not_converge_phase_by_phase():
+    # The loss 4 theta (1 - theta) O(h) of a touch, and theta changes by 1 over a change of O(h).
+    for n in (50, 100):
+        errors = rebound_gradient_errors(jc.ContactImplicit(), n)
+        assert np.abs(errors).max() > 0.3
+        assert abs(errors.mean()) < 0.2
+
+
+def test_contact_stabilized_gradient_of_a_rebound_converges():
+    coarse, fine = (rebound_gradient_errors(jc.ContactStabilized(), n) for n in (50, 200))
+    assert np.abs(coarse).max() < 0.25
+    assert np.abs(fine).max() < 0.02
 
 
 def test_trapezoidal_gradient_flows_through_the_force_of_the_last_step():
