@@ -99,7 +99,7 @@ def repeat_scalar(values: Array, n_components: int) -> Array:
     return repeated.reshape(width * n_components, n * n_components)
 
 
-def hat_gradients(points: Array, cells: np.ndarray) -> tuple[Array, Array]:
+def hat_gradients(points: Array, cells: Array | np.ndarray) -> tuple[Array, Array]:
     """Return hat function gradients (E, d+1, d) [1/m] and cell volumes (E,) [m^d]."""
     corners = points[cells]
     edges = corners[:, 1:] - corners[:, :1]  # (e, a, i)
@@ -134,7 +134,7 @@ def stiffness_blocks(gradients: Array, volumes: Array, lame: tuple) -> Array:
     return first[:, None, None, None, None] * outer + second[:, None, None, None, None] * isotropic
 
 
-def nodal_areas(points: Array, facets: np.ndarray) -> Array:
+def nodal_areas(points: Array, facets: Array | np.ndarray) -> Array:
     """Return the integral of each hat function over a facet set, (N,) [m^(d-1)] (1D: one)."""
     corners = points[facets]
     dimension = points.shape[1]

@@ -76,7 +76,11 @@ def _basis(system: System, modes: int, contact_responses: bool) -> np.ndarray:
     # A free body has rigid motions, on which the stiffness vanishes: shift by a small frequency.
     shift = 1e-3 * _lowest_scale(mass, stiffness)
     solve = scipy.sparse.linalg.splu((stiffness + shift * mass).tocsc()).solve
-    shifted = scipy.sparse.linalg.LinearOperator(mass.shape, matvec=solve, dtype=float)
+    shifted = scipy.sparse.linalg.LinearOperator(
+        mass.shape,
+        matvec=solve,  # type: ignore[reportCallIssue]
+        dtype=float,  # type: ignore[reportCallIssue]
+    )
     start = np.random.default_rng(0).standard_normal(system.size)
     _, vibrations = scipy.sparse.linalg.eigsh(
         stiffness, k=modes, M=mass, sigma=-shift, OPinv=shifted, v0=start

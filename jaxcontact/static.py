@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton, Solution, Status
-from jaxcontact.linear import Dense, LinearSolver
+from jaxcontact.linear import LinearSolver, check_memory, choose_linear_solver
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.simulate import SolveError
+from jaxcontact.stepper import unknown_coordinates
 from jaxcontact.system import System
 
 
@@ -60,7 +60,7 @@ def solve_static(
 
     Args:
         system: the discretised scene, clamped so that it cannot move rigidly.
-        linear_solver: factorises the stiffness matrix, default `Dense()`.
+        linear_solver: factorises the stiffness matrix, default chosen from the size.
         contact_solver: default `SemismoothNewton()`.
 
     Returns:
@@ -78,13 +78,12 @@ def solve_static(
             "a facet set, or let jc.simulate with jc.BackwardEuler() come to rest"
         )
     solver = SemismoothNewton() if contact_solver is None else contact_solver
-    linear_solver = Dense() if linear_solver is None else linear_solver
+    shape = (system.size, system.dimension, system.dtype.itemsize)
+    if linear_solver is None:
+        linear_solver = choose_linear_solver(*shape, is_dense=system.basis is not None)
+    check_memory(linear_solver, *shape)
     matrix, normals = jax.lax.stop_gradient((system.stiffness, system.normals))
-    coordinates = None
-    if not isinstance(system.points, Tracer):
-        nodes = np.asarray(system.points)[np.asarray(system.free_nodes)]
-        coordinates = np.repeat(nodes, system.dimension, axis=0)
-    factor = linear_solver.factorize(matrix, normals, coordinates)
+    factor = linear_solver.factorize(matrix, normals, unknown_coordinates(system))
     problem = ContactProblem(system.stiffness, system.normals, factor, solver)
     y, solution = _solve(system, problem)
     _check(solution.status)

@@ -107,7 +107,7 @@ def prepare(
         )
     check_memory(linear_solver, *shape)
     dt = jnp.asarray(dt, system.dtype)
-    coordinates = _coordinates(system)
+    coordinates = unknown_coordinates(system)
 
     def make_problem(matrix: SymmetricMatrix) -> ContactProblem:
         frozen = jax.lax.stop_gradient((matrix.values, system.normals.weights))
@@ -123,7 +123,7 @@ def prepare(
     return Stepper(system, dt, operators, scheme, linear_solver, contact_solver)
 
 
-def _coordinates(system: System) -> np.ndarray | None:
+def unknown_coordinates(system: System) -> np.ndarray | None:
     """Return the positions of the unknowns, (n, d), if they are concrete and have any."""
     if isinstance(system.points, Tracer) or system.basis is not None:
         return None

@@ -77,8 +77,9 @@ class BlockMatrix(NamedTuple):
 def from_symmetric(matrix: SymmetricMatrix, dimension: int) -> BlockMatrix:
     """Return a matrix that was assembled from nodal blocks (d, d) as a block matrix."""
     d, n_nodes = dimension, matrix.size // dimension
-    width = matrix.columns.shape[0] // d
-    nodes = np.asarray(matrix.columns).reshape(width, d, n_nodes, d)[:, 0, :, 0] // d
+    columns = np.asarray(matrix.columns)
+    width = columns.shape[0] // d
+    nodes = columns.reshape(width, d, n_nodes, d)[:, 0, :, 0] // d
     blocks = (
         on_host(matrix.values).reshape(width, d, n_nodes, d).transpose(0, 2, 3, 1)
     )  # (slot, row, i, j)
