@@ -97,6 +97,11 @@ class System:
         return self.points.shape[-2]
 
     @property
+    def is_clamped(self) -> bool:
+        """Whether some nodes are clamped."""
+        return len(self.free_nodes) < self.n_nodes
+
+    @property
     def dtype(self):
         """Floating point type of every array."""
         return self.load.dtype
@@ -266,12 +271,7 @@ def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Arra
         areas.append(assembly.nodal_areas(points, facets)[set_nodes])
     if not nodes:
         nothing = jnp.zeros(0, points.dtype)
-        return (
-            np.zeros(0, np.int32),
-            nothing,
-            jnp.zeros((0, points.shape[1]), points.dtype),
-            nothing,
-        )
+        return np.zeros(0, np.int32), nothing, points[:0], nothing
     return (
         np.concatenate(nodes).astype(np.int32),
         jnp.concatenate(gaps),
@@ -281,13 +281,17 @@ def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Arra
 
 
 def _free_components(system: System, y: Array) -> Array:
-    free = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
-    return free.reshape(*y.shape[:-2], -1)
+    if system.is_clamped:
+        y = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
+    return y.reshape(*y.shape[:-2], -1)
 
 
 def _lift(system: System, x: Array) -> Array:
     if system.basis is not None:
         x = x @ system.basis.vectors.T
     free = x.reshape(*x.shape[:-1], -1, system.dimension)
+    if not system.is_clamped:
+        return free
     padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
-    return jnp.take(jnp.concatenate([free, padding], axis=-2), system.node_numbers, axis=-2)
+    free = jnp.concatenate([free, padding], axis=-2)
+    return jnp.take(free, system.node_numbers, axis=-2, mode="clip")

@@ -74,6 +74,14 @@ class Unknowns(NamedTuple):
     """Place in the order of elimination."""
 
 
+def round_up(n_own):
+    """Return the number of own unknowns that a front is padded to.
+
+    The product with V^T works on rows of that length: whole vector registers double its speed.
+    """
+    return -(-n_own // 4) * 4
+
+
 def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Stage:
     """Lay out the fronts of one stage.
 
@@ -89,7 +97,7 @@ def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Sta
     b_max = np.zeros(batch.max() + 1, np.int64)
     np.maximum.at(s_max, batch, n_own)
     np.maximum.at(b_max, batch, n_boundary)
-    s, b = s_max[batch], b_max[batch]
+    s, b = round_up(s_max)[batch], b_max[batch]
     order = np.argsort(batch, kind="stable")
     index = np.empty_like(batch)
     index[order] = np.arange(len(batch)) - np.searchsorted(batch[order], batch[order])

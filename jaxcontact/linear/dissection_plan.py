@@ -19,13 +19,20 @@ from typing import NamedTuple
 import numpy as np
 from jax.core import Tracer
 
-from jaxcontact.linear.dissection_layout import BatchPlan, Unknowns, lay_out, make_stage, places
+from jaxcontact.linear.dissection_layout import (
+    BatchPlan,
+    Unknowns,
+    lay_out,
+    make_stage,
+    places,
+    round_up,
+)
 from jaxcontact.linear.dissection_order import dissect, hop_coordinates
 
-LAUNCH_COST = 20_000
-"""Time of the kernels of one batch, in numbers streamed in that time (about 3 us on a CPU)."""
+LAUNCH_COST = 10_000
+"""Time of the kernels of one batch, in numbers streamed in that time (some 2 us on a CPU)."""
 
-COMPILE_COST = 0.01
+COMPILE_COST = 0.003
 """Share of the streamed numbers that a batch must save to be worth its compilation."""
 
 
@@ -217,7 +224,7 @@ def _batch(own, boundary, batch_cost, n_cuts=12):
     """Split fronts into batches of similar size: batch of each front (F,), and the cost."""
     order = np.argsort(own * (own + 2 * boundary), kind="stable")
     cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
-    s = np.maximum.reduceat(own[order], cuts[:-1])
+    s = round_up(np.maximum.reduceat(own[order], cuts[:-1]))
     b = np.maximum.reduceat(boundary[order], cuts[:-1])
     best, start = [0.0], [0]
     for j in range(1, len(cuts)):

@@ -211,9 +211,9 @@ def _sum_sources(update, sources):
 def _materialize(x, origin):
     """Return x as a buffer of its own.
 
-    XLA fuses the producer of x, for a right-hand side some thirty scattered reads per entry, into
-    every gather of a sweep, and drops optimization barriers on CPUs. An update at an index that it
-    does not know stops that.
+    XLA fuses the producer of x into every gather of a sweep: for a right-hand side some thirty
+    scattered reads per entry, for the solution of several stages a chain of selects. It drops
+    optimization barriers on CPUs; an update at an index that it does not know stops it.
     """
     return jax.lax.dynamic_update_slice_in_dim(x, x[:1], origin, axis=0)
 
@@ -228,8 +228,8 @@ def _up(factor, rhs) -> Partial:
             s = batch.own.shape[1]
             own, passed = take(rhs, batch.own), 0.0
             if update is not None:
-                gathered = _sum_sources(update, batch.sources)
-                own, passed = own + gathered[:, :s], gathered[:, s:]
+                own = own + _sum_sources(update, batch.sources[:, :, :s])
+                passed = _sum_sources(update, batch.sources[:, :, s:])
             stage_values.append(jnp.einsum("fij,fj...->fi...", batch.inverse, own))
             change = passed - jnp.einsum("fbj,fj...->fb...", batch.coupling, own)
             updates.append(change.reshape(-1, *rhs.shape[1:]))
@@ -250,7 +250,7 @@ def _down(factor, values, root) -> Array:
             later = take(solution, batch.boundary)
             y = z - jnp.einsum("fbj,fb...->fj...", batch.coupling, later)
             found.append(y.reshape(-1, *root.shape[1:]))
-        solution = jnp.concatenate(found)
+        solution = _materialize(jnp.concatenate(found), factor.origin)
     return take(solution, factor.places)
 
 
