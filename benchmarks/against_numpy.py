@@ -12,7 +12,6 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-import bodies
 import jax
 import jax.numpy as jnp
 import measure
@@ -20,6 +19,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
+import speed_scenes
 
 import jaxcontact as jc
 
@@ -65,7 +65,7 @@ def one_blas_thread() -> Any:
 class NumpyLoop:
     """The contact-implicit scheme (MATH.md 2) and its adjoint (MATH.md 3) as Python loops."""
 
-    def __init__(self, body: bodies.Body, factorize: Any):
+    def __init__(self, body: speed_scenes.Body, factorize: Any):
         """Factor the matrix and precompute the contact compliance."""
         system = body.system
         self.dt = body.dt
@@ -152,15 +152,15 @@ def assert_equal(name: str, ours: Any, theirs: Any, tolerance: float) -> float:
 
 def measure_size(shape: str, n: int, solver: str, steps: int, dtype: Any, repeats: int) -> dict:
     """Return one row: our program against every loop on one body."""
-    body = bodies.SHAPES[shape](n, dtype)
-    stepper = bodies.prepare(body, solver)
+    body = speed_scenes.SHAPES[shape](n, dtype)
+    stepper = speed_scenes.prepare(body, solver)
     control = body.control(steps)
     arguments = (stepper, body.initial, control)
     forward, _ = measure.compiled(lambda s, i, u: jc.simulate(s, u, initial=i), *arguments)
     gradient, _ = measure.compiled(jax.value_and_grad(objective, argnums=2), *arguments)
     trajectory = forward(*arguments)
     row: dict[str, Any] = {"shape": shape, **body.sizes, "steps": steps}
-    row |= bodies.check(trajectory)
+    row |= speed_scenes.check(trajectory)
     force = np.asarray(control)
     runs = {
         "forward": lambda: forward(*arguments),
@@ -215,7 +215,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments = measure.parser(__doc__)
     arguments.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     arguments.add_argument("--shapes", nargs="*", default=["rectangle", "half_disc"])
-    arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
+    arguments.add_argument("--solver", choices=speed_scenes.SOLVERS, default="dissection")
     options = measure.parse(arguments, argv)
     if options.quick:
         options.sizes, options.shapes = [100], ["half_disc"]

@@ -9,10 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import bodies
 import jax
 import jax.numpy as jnp
 import measure
+import speed_scenes
 
 import jaxcontact as jc
 
@@ -30,8 +30,8 @@ def measure_size(
     n: int, batches: list[int], solver: str, steps: int, dtype: Any, repeats: int
 ) -> list[dict]:
     """Return one row per batch size; all sizes take turns."""
-    body = bodies.rectangle(n, dtype)
-    stepper = bodies.prepare(body, solver)
+    body = speed_scenes.rectangle(n, dtype)
+    stepper = speed_scenes.prepare(body, solver)
     base = body.control(steps)
 
     def forward(stepper: jc.Stepper, initial: jc.State, control: jax.Array) -> jc.Trajectory:
@@ -46,7 +46,7 @@ def measure_size(
             batched = function if size == 0 else jax.vmap(function, in_axes=(None, None, 0))
             program, _ = measure.compiled(batched, stepper, body.initial, control)
             programs.append(program)
-        bodies.check(programs[0](stepper, body.initial, control))
+        speed_scenes.check(programs[0](stepper, body.initial, control))
         for name, program in zip(("forward", "gradient"), programs, strict=True):
             runs[f"{name}{size}"] = lambda program=program, control=control: program(
                 stepper, body.initial, control
@@ -89,7 +89,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     arguments.add_argument("--batches", type=int, nargs="*", default=BATCHES)
     arguments.add_argument("--steps", type=int, default=50)
-    arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
+    arguments.add_argument("--solver", choices=speed_scenes.SOLVERS, default="dissection")
     options = measure.parse(arguments, argv)
     if options.quick:
         options.sizes, options.batches, options.steps = [100], [2], 20

@@ -9,10 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import bodies
 import jax
 import jax.numpy as jnp
 import measure
+import speed_scenes
 
 import jaxcontact as jc
 
@@ -26,7 +26,7 @@ def objective(stepper: jc.Stepper, initial: jc.State, control: jax.Array) -> jax
     return 0.5 * jnp.sum(trajectory.displacement[-1] ** 2)
 
 
-def measure_size(body: bodies.Body, stepper: jc.Stepper, steps: int) -> dict[str, Any]:
+def measure_size(body: speed_scenes.Body, stepper: jc.Stepper, steps: int) -> dict[str, Any]:
     """Return one row; nothing runs, so that the control need not exist."""
     shape = (steps, body.system.n_nodes, body.system.dimension)
     control = jax.ShapeDtypeStruct(shape, body.system.dtype)
@@ -64,15 +64,15 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments = measure.parser(__doc__)
     arguments.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     arguments.add_argument("--steps", type=int, nargs="*", default=STEPS)
-    arguments.add_argument("--shape", choices=bodies.SHAPES, default="half_disc")
-    arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
+    arguments.add_argument("--shape", choices=speed_scenes.SHAPES, default="half_disc")
+    arguments.add_argument("--solver", choices=speed_scenes.SOLVERS, default="dissection")
     options = measure.parse(arguments, argv)
     if options.quick:
         options.sizes, options.steps = [100], [10, 20]
     rows = []
     for n in options.sizes:
-        body = bodies.SHAPES[options.shape](n, options.dtype)
-        stepper = bodies.prepare(body, options.solver)
+        body = speed_scenes.SHAPES[options.shape](n, options.dtype)
+        stepper = speed_scenes.prepare(body, options.solver)
         rows += [measure_size(body, stepper, steps) for steps in options.steps]
     measure.print_table(rows)
     measure.save("compile_time", rows, options.out, shape=options.shape, solver=options.solver)

@@ -12,35 +12,35 @@ import math
 from pathlib import Path
 from typing import Any
 
-import bodies
 import jax
 import jax.numpy as jnp
 import measure
 import numpy as np
+import speed_scenes
 from jax import Array
 
 import jaxcontact as jc
-from jaxcontact.contact import ContactSolver, Status
+from jaxcontact.contact import ContactSolver, Guess, Status
 
 PAIRS = [10, 20, 50, 100, 200, 500, 1_000]
 LAYERS = 2
 
 
-def flat_box(pairs: int, dtype: Any) -> bodies.Body:
+def flat_box(pairs: int, dtype: Any) -> speed_scenes.Body:
     """Return a flat box with about that many nodes at the bottom."""
     m = max(2, round(math.sqrt(pairs)) - 1)
     lengths = (1.0, 1.0, LAYERS / m)
     mesh = jc.meshes.box(lengths, h=(1.0 + 1e-9) / m)
-    return bodies.thrown(mesh, "bottom", 1.0 / m, dtype)
+    return speed_scenes.thrown(mesh, "bottom", 1.0 / m, dtype)
 
 
-def offsets(body: bodies.Body, steps: int) -> Array:
+def offsets(body: speed_scenes.Body, steps: int) -> Array:
     """Return offsets (T, C): a tilted face that meets the plane, with a line that moves."""
     system = body.system
     x = system.points[system.contact_nodes, 0][None, :]
     phase = jnp.arange(steps, dtype=system.dtype)[:, None]
     line = 0.6 + 0.1 * jnp.sin(0.1 * phase)
-    return bodies.THROW * jnp.tanh(4.0 * (x - line))
+    return speed_scenes.THROW * jnp.tanh(4.0 * (x - line))
 
 
 def solve_all(solver: ContactSolver, is_warm: bool):
@@ -48,12 +48,13 @@ def solve_all(solver: ContactSolver, is_warm: bool):
 
     def run(compliance: Array, offset: Array):
         resolution = jnp.zeros_like(offset[0])
+        first = Guess(jnp.zeros(offset.shape[1], bool), solver.first_memory(compliance))
 
-        def step(active: Array, q: Array):
-            solution = solver.solve(compliance, q, resolution, active)
-            return (solution.active if is_warm else active), solution
+        def step(guess: Guess, q: Array):
+            solution = solver.solve(compliance, q, resolution, guess)
+            return (solution.guess if is_warm else guess), solution._replace(memory=())
 
-        return jax.lax.scan(step, jnp.zeros(offset.shape[1], bool), offset)[1]
+        return jax.lax.scan(step, first, offset)[1]
 
     return run
 
@@ -68,7 +69,7 @@ SOLVERS = {
 def measure_pairs(pairs: int, steps: int, dtype: Any, repeats: int) -> dict[str, Any]:
     """Return one row: all solvers on one compliance."""
     body = flat_box(pairs, dtype)
-    compliance = bodies.prepare(body).operators.problem.factor.compliance
+    compliance = speed_scenes.prepare(body).operators.problem.factor.compliance
     offset = offsets(body, steps)
     row: dict[str, Any] = {**body.sizes, "steps": steps}
     eigenvalues = np.linalg.eigvalsh(np.asarray(compliance, float))

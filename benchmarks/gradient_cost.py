@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import alternatives
-import bodies
 import jax
 import jax.numpy as jnp
 import measure
 import numpy as np
+import speed_scenes
 from jax import Array
 
 import jaxcontact as jc
@@ -43,7 +43,7 @@ def by_control(checkpoint: jc.Checkpoint | None):
     return objective
 
 
-def by_material(body: bodies.Body, solver: str, steps: int, checkpoint: jc.Checkpoint | None):
+def by_material(body: speed_scenes.Body, solver: str, steps: int, checkpoint: jc.Checkpoint | None):
     """Return (initial, material) -> cost, with assembly and factorisation inside."""
 
     def objective(initial: jc.State, material: jc.KelvinVoigt) -> Array:
@@ -51,14 +51,16 @@ def by_material(body: bodies.Body, solver: str, steps: int, checkpoint: jc.Check
             body.scene.mesh, material, contact=body.scene.contact, body_force=body.scene.body_force
         )
         system = jc.discretize(scene, dtype=body.system.dtype)
-        stepper = jc.prepare(system, body.dt, linear_solver=bodies.SOLVERS[solver])
+        stepper = jc.prepare(system, body.dt, linear_solver=speed_scenes.SOLVERS[solver])
         trajectory = jc.simulate(stepper, steps=steps, initial=initial, checkpoint=checkpoint)
         return cost(trajectory.displacement)
 
     return objective
 
 
-def programs(body: bodies.Body, stepper: jc.Stepper, solver: str, steps: int) -> dict[str, tuple]:
+def programs(
+    body: speed_scenes.Body, stepper: jc.Stepper, solver: str, steps: int
+) -> dict[str, tuple]:
     """Return the objectives with their arguments; the last argument is differentiated."""
     control = body.control(steps)
     arguments = (stepper, body.initial, control)
@@ -84,9 +86,9 @@ def measure_size(
     n: int, steps: int, kinds: list[str], solver: str, dtype: Any, repeats: int
 ) -> list[dict]:
     """Return one row per kind of gradient."""
-    body = bodies.half_disc(n, dtype)
-    stepper = bodies.prepare(body, solver)
-    contact = bodies.check(jc.simulate(stepper, body.control(steps), initial=body.initial))
+    body = speed_scenes.half_disc(n, dtype)
+    stepper = speed_scenes.prepare(body, solver)
+    contact = speed_scenes.check(jc.simulate(stepper, body.control(steps), initial=body.initial))
     runs, rows, exact = {}, [], None
     for name, (objective, arguments) in programs(body, stepper, solver, steps).items():
         if name not in kinds:
@@ -156,7 +158,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     arguments.add_argument("--steps", type=int, nargs="*", default=STEPS)
     arguments.add_argument("--kinds", nargs="*", choices=KINDS, default=KINDS)
-    arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
+    arguments.add_argument("--solver", choices=speed_scenes.SOLVERS, default="dissection")
     options = measure.parse(arguments, argv)
     if options.quick:
         options.sizes, options.steps, options.solver = [60], [16], "dense"

@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import bodies
 import jax
 import measure
 import numpy as np
+import speed_scenes
 
 import jaxcontact as jc
 from jaxcontact.linear import dissection_plan
@@ -25,7 +25,7 @@ SIZES_2D = [500, 2_000, 10_000, 50_000, 200_000]
 SIZES_3D = [3_000, 20_000, 80_000]
 
 
-def factor_entries(body: bodies.Body) -> int:
+def factor_entries(body: speed_scenes.Body) -> int:
     """Return the number of nonzeros of the Cholesky factor, sum of s (s + 1) / 2 + s b."""
     system = body.system
     coordinates = np.repeat(
@@ -42,19 +42,19 @@ def factor_entries(body: bodies.Body) -> int:
 
 def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeats: int) -> dict:
     """Return one row: a body of a shape with about n unknowns."""
-    body = bodies.SHAPES[shape](n, dtype)
+    body = speed_scenes.SHAPES[shape](n, dtype)
     start = time.perf_counter()
-    stepper = jax.block_until_ready(bodies.prepare(body, solver))
+    stepper = jax.block_until_ready(speed_scenes.prepare(body, solver))
     prepare_s = time.perf_counter() - start
     start = time.perf_counter()
-    jax.block_until_ready(bodies.prepare(body, solver))
+    jax.block_until_ready(speed_scenes.prepare(body, solver))
     prepare_again_s = time.perf_counter() - start
 
     def run(stepper: jc.Stepper, initial: jc.State) -> jc.Trajectory:
         return jc.simulate(stepper, steps=steps, initial=initial)
 
     program, compile_s = measure.compiled(run, stepper, body.initial)
-    contact = bodies.check(program(stepper, body.initial))
+    contact = speed_scenes.check(program(stepper, body.initial))
     entries = factor_entries(body)
     buffer = np.ones(entries, dtype)
 
@@ -119,8 +119,8 @@ def main(argv: list[str] | None = None) -> list[dict]:
     arguments = measure.parser(__doc__)
     arguments.add_argument("--sizes-2d", type=int, nargs="*", default=SIZES_2D)
     arguments.add_argument("--sizes-3d", type=int, nargs="*", default=SIZES_3D)
-    arguments.add_argument("--shapes", nargs="*", default=list(bodies.SHAPES))
-    arguments.add_argument("--solver", choices=bodies.SOLVERS, default="dissection")
+    arguments.add_argument("--shapes", nargs="*", default=list(speed_scenes.SHAPES))
+    arguments.add_argument("--solver", choices=speed_scenes.SOLVERS, default="dissection")
     arguments.add_argument("--fit-from", type=int, default=9_000, help="smallest n of the fit")
     options = measure.parse(arguments, argv)
     if options.quick:

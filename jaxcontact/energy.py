@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.contact import Guess
 from jaxcontact.schemes import StepState
 from jaxcontact.stepper import Stepper
 from jaxcontact.trajectory import Trajectory
@@ -30,6 +31,10 @@ class Energy:
 
     elastic: Array
     """1/2 y.Ay, (T+1,) [J]."""
+
+    change: Array
+    """E' - E of each step, (T,) [J], to the digits of the step: the difference of two `total` loses
+    those of y.Ay, whose terms are (L/h)^2 times as large as their sum."""
 
     work: Array
     """Work of control, body force and traction in each step, (T,) [J]."""
@@ -74,7 +79,7 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         displacement=system.restrict(trajectory.displacement),
         velocity=system.restrict(trajectory.velocity),
         impulse=nothing_yet(trajectory.contact_impulse),
-        active=nothing_yet(trajectory.active),
+        guess=Guess(nothing_yet(trajectory.active)),
     )
 
     def measure(state: StepState) -> tuple[Array, Array]:
@@ -84,18 +89,23 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
 
     def flow(old: StepState, new: StepState, force: Array | None):
         load = system.load if force is None else system.load + system.control_load(force)
-        return stepper.scheme.energy_flow(system, operators, stepper.dt, old, new, load)
+        velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
+        change = 0.5 * (
+            jnp.dot(new.velocity - old.velocity, operators.mass @ velocity)
+            + jnp.dot(new.displacement - old.displacement, system.stiffness @ displacement)
+        )
+        return change, stepper.scheme.energy_flow(system, operators, stepper.dt, old, new, load)
 
     kinetic, elastic = jax.lax.map(measure, states)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
-    flows = jax.lax.map(lambda step: flow(*step), (old, new, control))
-    change = jnp.diff(kinetic + elastic)
+    change, flows = jax.lax.map(lambda step: flow(*step), (old, new, control))
     numerical_loss = jnp.asarray(flows.numerical_loss, change.dtype)
     loss = flows.viscous_loss + flows.impact_loss + numerical_loss
     return Energy(
         kinetic=kinetic,
         elastic=elastic,
+        change=change,
         work=flows.work,
         viscous_loss=flows.viscous_loss,
         impact_loss=flows.impact_loss,

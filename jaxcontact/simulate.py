@@ -17,6 +17,7 @@ from jaxcontact.contact.branch import (
     along_direction,
     check_weak_contact,
     float_leaves,
+    forward_mode_advice,
     tangent_of,
     with_weak_contact,
 )
@@ -49,8 +50,7 @@ def simulate(
 
     Args:
         stepper: from `prepare`.
-        control: force density u, (T, N, d) [N/m^d], piecewise constant in time and P1 in space;
-            None is none.
+        control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or None.
         steps: number of steps T; default the length of the control.
         initial: state at time zero; default at rest without displacement.
         save_every: number of steps k between recorded states, a divisor of T: displacement,
@@ -83,7 +83,8 @@ def simulate(
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
     check_weak_contact(weak_contact)
-    trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
+    with forward_mode_advice():
+        trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
@@ -131,8 +132,8 @@ def _run(
         displacement=system.restrict(initial.displacement),
         velocity=system.restrict(initial.velocity),
         impulse=jnp.zeros(system.normals.count, system.dtype),
-        active=jnp.zeros(system.normals.count, bool),
-        memory=stepper.scheme.memory(system),
+        guess=operators.problem.first_guess(),
+        memory=stepper.scheme.memory(system, operators),
     )
 
     def advance(state: StepState, inputs: tuple[Array | None, Array, StepShift | None]):
@@ -141,7 +142,7 @@ def _run(
         load = system.load if force is None else system.load + system.control_load(force)
         load = load if shift is None else load + shift.load
         state, info = stepper.scheme.step(now, at_step(operators, step), dt, state, load)
-        return state, (state.impulse, state.active, info)
+        return state, (state.impulse, state.guess.active, info)
 
     inputs = (control, jnp.arange(steps), shift)
     if isinstance(weak_contact, AlongDirection):
@@ -174,6 +175,7 @@ def _run(
         iterations=info.iterations,
         status=info.status,
         residual=info.residual,
+        weak=info.weak,
     )
 
 

@@ -104,7 +104,7 @@ def _solve(system: System, problem: ContactProblem) -> tuple[Array, Solution]:
         system.load,
         bound=system.gap,
         resolution=gap_resolution(system, jnp.zeros_like(system.load)),
-        guess=system.gap < 0.0,
+        guess=problem.first_guess()._replace(active=system.gap < 0.0),
     )
 
 

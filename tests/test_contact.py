@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcontact as jc
-from jaxcontact.contact import Status
+from jaxcontact.contact import Guess, Status
 from jaxcontact.contact.complementarity import solve_on_set
 
 # Both solvers stop at a residual of 1e-11 of the largest violation.
@@ -36,7 +36,7 @@ def solve(solver, compliance, offset, guess=None, resolution=None):
 
 @jax.jit(static_argnums=0)
 def _solve(solver, compliance, offset, resolution, guess):
-    return solver.solve(compliance, offset, resolution, guess)
+    return solver.solve(compliance, offset, resolution, Guess(guess))
 
 
 def random_problem(seed, coupling, n=N_PAIRS):
@@ -194,7 +194,7 @@ def test_contact_solver_under_vmap_equals_the_loop(solver):
     problems = [random_problem(seed, 1.0) for seed in range(8)]
     compliance, offset = (jnp.asarray(np.stack(x)) for x in zip(*problems, strict=True))
     nothing = jnp.zeros((8, N_PAIRS))
-    together = jax.vmap(solver.solve)(compliance, offset, nothing, nothing > 0)
+    together = jax.vmap(solver.solve)(compliance, offset, nothing, Guess(nothing > 0))
     for k, problem in enumerate(problems):
         alone = solve(solver, *problem)
         np.testing.assert_allclose(together.multiplier[k], alone.multiplier, atol=KKT_TOLERANCE)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from kinked import DT, grazing
 
 import jaxcontact as jc
+from jaxcontact.contact import Guess
 
 EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
 N_PAIRS = 7
@@ -21,7 +22,7 @@ DIFFERENCES = 1e-6
 @partial(jax.jit, static_argnames="max_steps")
 def solve(kappa, compliance, offset, guess, max_steps=100):
     nothing = jnp.zeros_like(offset)
-    return jc.RelaxedContact(kappa, max_steps).solve(compliance, offset, nothing, guess)
+    return jc.RelaxedContact(kappa, max_steps).solve(compliance, offset, nothing, Guess(guess))
 
 
 def random_problem(seed, coupling):
@@ -70,7 +71,9 @@ def test_relaxed_contact_of_one_pair_solves_a_quadratic_equation():
 def test_relaxed_contact_tends_to_exact_contact_linearly_in_kappa():
     compliance, offset, size = random_problem(3, 1.0)
     data = (jnp.asarray(compliance), jnp.asarray(offset), jnp.zeros(N_PAIRS, bool))
-    exact = jc.SemismoothNewton().solve(data[0], data[1], jnp.zeros(N_PAIRS), data[2]).multiplier
+    exact = (
+        jc.SemismoothNewton().solve(data[0], data[1], jnp.zeros(N_PAIRS), Guess(data[2])).multiplier
+    )
     errors = [
         np.max(np.abs(solve(kappa * size, *data).multiplier - exact)) for kappa in (1e-6, 1e-8)
     ]

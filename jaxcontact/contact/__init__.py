@@ -1,6 +1,6 @@
 """The contact problem of one time step: its solvers, and its derivative on the critical cone."""
 
-from jaxcontact.contact.complementarity import ContactSolver, Solution, Status
+from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
 from jaxcontact.contact.gauss_seidel import ProjectedGaussSeidel
 from jaxcontact.contact.newton import SemismoothNewton
 from jaxcontact.contact.relaxed import RelaxedContact, with_contact
@@ -19,6 +19,7 @@ __all__ = [
     "ContactProblem",
     "ContactSolver",
     "CriticalCone",
+    "Guess",
     "Inactive",
     "OnBranch",
     "ProjectedGaussSeidel",

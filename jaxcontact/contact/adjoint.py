@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import custom_vjp_primal_tree_values
 
@@ -29,19 +30,23 @@ from jaxcontact.symmetric_product import outer_on_pattern
 
 
 class Residuals(NamedTuple):
-    """What a step keeps for its backward pass; None where nothing asks for it."""
+    """What a step keeps for its backward pass; empty arrays where nothing asks for it.
+
+    Not None: JAX unflattens the residuals of one compiled program by the tree of the gradient that
+    was traced last, so a second gradient, by other data, must not have another tree.
+    """
 
     pairs: Array
     """A, (C,) bool: all that the gradient by loads, states, gaps and bounds needs."""
 
     softness: Array | None
-    """dg/dp of a relaxed contact law, (C,)."""
+    """dg/dp of a relaxed contact law, (C,); None if contact is exact."""
 
-    velocity: Array | None
-    """w, (n,), if matrix or normals are differentiated."""
+    velocity: Array
+    """w, (n,), if matrix or normals are differentiated, else (0,)."""
 
-    multiplier: Array | None
-    """p, (C,), if the normals are differentiated."""
+    multiplier: Array
+    """p, (C,), if the normals are differentiated, else (0,)."""
 
     values: Array
     """Entries of D (the same in every step, stored once)."""
@@ -72,11 +77,12 @@ def _solve_fwd(*arguments):
     is_matrix_asked, is_normals_asked = arguments[0].perturbed, arguments[1].perturbed
     w, solution = solve_forward(ALGORITHM_1, values, weights, rhs, bound, fixed)
     pairs, softness = linear_contact(ALGORITHM_1, weights, bound, fixed, w, solution)
+    nothing = jnp.zeros(0, w.dtype)
     residuals = Residuals(
         pairs=pairs,
         softness=softness,
-        velocity=w if is_matrix_asked or is_normals_asked else None,
-        multiplier=solution.multiplier if is_normals_asked else None,
+        velocity=w if is_matrix_asked or is_normals_asked else nothing,
+        multiplier=solution.multiplier if is_normals_asked else nothing,
         values=values,
         weights=weights,
         # What changes from step to step and is not needed again.
@@ -98,9 +104,9 @@ def _solve_bwd(residuals, cotangents):
         instantiate(solution_bar.multiplier),
     )
     values_bar = weights_bar = None
-    if velocity is not None:
+    if velocity.size:
         values_bar = -outer_on_pattern(fixed.columns, rhs_bar, velocity)
-    if velocity is not None and multiplier is not None:
+    if multiplier.size:
         weights_bar = -(
             multiplier[:, None] * rhs_bar[fixed.unknowns]
             + bound_bar[:, None] * velocity[fixed.unknowns]

@@ -6,7 +6,8 @@ direction. That derivative decides each weak pair and is a constant for the grad
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +38,22 @@ def check_weak_contact(choice: Any) -> None:
     """Raise a ValueError if the choice is a class or a string instead of an object."""
     if isinstance(choice, type | str):
         raise ValueError(f"weak_contact must be an object, such as jc.Strong(), got {choice!r}")
+
+
+@contextmanager
+def forward_mode_advice() -> Iterator[None]:
+    """Say how forward mode is had where JAX only says that a custom_vjp has none."""
+    try:
+        yield
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise TypeError(
+            "simulate has reverse mode only, as jax.grad uses it, unless weak_contact names what "
+            "forward mode means at weak contact: simulate(..., weak_contact=jc.Strong()), the "
+            "derivative that jax.grad takes, or jc.CriticalCone(), the exact one-sided one; "
+            "see also jc.directional_derivative"
+        ) from error
 
 
 def along_direction(advance: Callable[[Any, Any], tuple[Any, Any]]) -> Callable:

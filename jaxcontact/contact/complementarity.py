@@ -10,7 +10,7 @@ Source: MATH.md 2.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,16 @@ class Status(IntEnum):
     NON_FINITE = 3
 
 
+class Guess(NamedTuple):
+    """What one step hands to the contact problem of the next."""
+
+    active: Array
+    """Active set to start from, (C,) bool."""
+
+    memory: Any = ()
+    """What else the contact solver keeps, see `ContactSolver.first_memory`."""
+
+
 class Solution(NamedTuple):
     """The solution of the complementarity problem of C contact pairs."""
 
@@ -50,18 +60,35 @@ class Solution(NamedTuple):
     residual: Array
     """KKT residual relative to the largest violation of the free motion, scalar."""
 
+    memory: Any = ()
+    """What the contact solver hands to the next step; never differentiated."""
+
+    @property
+    def weak(self) -> Array:
+        """Pairs in weak contact, (C,) bool: active without a multiplier."""
+        return self.active & ~(self.multiplier > 0.0)
+
+    @property
+    def guess(self) -> Guess:
+        """Where the next step starts."""
+        return Guess(self.active, self.memory)
+
 
 class ContactSolver(Protocol):
     """An option object: a pytree; `jax.tree_util.register_static` if it holds no array."""
 
-    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+    def first_memory(self, compliance: Array) -> Any:
+        """Return what the solver keeps between the steps of W, (C, C); () if nothing."""
+        ...
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Guess) -> Solution:
         """Solve the complementarity problem.
 
         Args:
             compliance: W, (C, C) SPD.
             offset: q, (C,).
             resolution: rounding error of q, (C,); smaller values are zero.
-            guess: active set to start from, (C,) bool.
+            guess: where to start; its memory may be missing.
         """
         ...
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import complementarity
-from jaxcontact.contact.complementarity import Solution
+from jaxcontact.contact.complementarity import Guess, Solution
 
 
 def sweep(compliance: Array, offset: Array, multiplier: Array) -> Array:
@@ -54,7 +54,11 @@ class ProjectedGaussSeidel:
     max_sweeps: int = 20_000
     """A step that needs more sweeps ends as not converged."""
 
-    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+    def first_memory(self, compliance: Array) -> tuple[()]:
+        """Return (): nothing is kept between steps."""
+        return ()
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Guess) -> Solution:
         """Solve the complementarity problem; see `ContactSolver.solve`."""
         # The guess is an active set, which sweeps cannot use: they start from the free motion.
         start = jnp.zeros_like(offset)

@@ -14,14 +14,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import complementarity, gauss_seidel
-from jaxcontact.contact.complementarity import Solution, separation, solve_on_set
+from jaxcontact.contact import complementarity, gauss_seidel, pivoting
+from jaxcontact.contact.complementarity import Guess, Solution, separation
+from jaxcontact.contact.pivoting import PivotedCompliance
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class SemismoothNewton:
-    """Primal-dual active set method, warm-started with the active set of the last step."""
+    """Primal-dual active set method, warm-started with active set and factor of the last step."""
 
     max_steps: int = 30
     """Number of active sets before the safeguard takes over."""
@@ -29,7 +30,11 @@ class SemismoothNewton:
     max_sweeps: int = 20_000
     """Gauss-Seidel sweeps of the safeguard before a step ends as not converged."""
 
-    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+    def first_memory(self, compliance: Array) -> PivotedCompliance:
+        """Return the compliance, which each step solves for its active set and hands on."""
+        return pivoting.unpivoted(compliance)
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Guess) -> Solution:
         """Solve the complementarity problem; see `ContactSolver.solve`."""
         diagonal = jnp.diagonal(compliance)
 
@@ -42,24 +47,29 @@ class SemismoothNewton:
             return stays | enters
 
         def is_unfinished(carry):
-            _, _, is_repeated, steps = carry
+            _, _, _, is_repeated, steps = carry
             return ~is_repeated & (steps < self.max_steps)
 
         def advance(carry):
-            active, _, _, steps = carry
-            p = solve_on_set(compliance, active, None, jnp.where(active, -offset, 0.0))
+            active, pivoted, _, _, steps = carry
+            pivoted = pivoting.pivot(pivoted, compliance, active)
+            p, pivoted = pivoting.solve(pivoted, compliance, offset)
             following = next_set(active, p)
-            return following, p, jnp.all(following == active), steps + 1
+            is_repeated = jnp.all(following == active) & (pivoted.exchanges < pivoting.WORN)
+            return following, pivoted, p, is_repeated, steps + 1
 
-        start = (guess, jnp.zeros_like(offset), jnp.bool_(False), jnp.int32(0))
-        _, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
+        active, pivoted = guess
+        pivoted = pivoted if pivoted else self.first_memory(compliance)
+        start = (active, pivoted, jnp.zeros_like(offset), jnp.bool_(False), jnp.int32(0))
+        _, pivoted, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
         p = jnp.maximum(p, 0.0)
 
         # Without a cycle the budget of sweeps is zero and the safeguard costs nothing.
         goal = 0.01 * complementarity.tolerance(offset, resolution) + 0.1 * resolution
         budget = jnp.where(is_repeated, 0, self.max_sweeps)
         p, _ = gauss_seidel.iterate(compliance, offset, p, goal, budget)
-        return complementarity.finish(compliance, offset, resolution, p, steps, ~is_repeated)
+        solution = complementarity.finish(compliance, offset, resolution, p, steps, ~is_repeated)
+        return solution._replace(memory=pivoted)
 
     def softness(self, solution_multiplier: Array, separation: Array) -> None:
         """Return None: contact is exact."""

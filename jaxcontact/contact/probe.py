@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact.complementarity import ContactSolver, Solution
+from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution
 from jaxcontact.contact.vi import ContactProblem
 
 
@@ -34,7 +34,11 @@ class OpenInDerivative:
     is_open: Array
     """(C,) bool."""
 
-    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+    def first_memory(self, compliance: Array) -> Any:
+        """Return what the solver keeps between steps; see `ContactSolver.first_memory`."""
+        return self.contact_solver.first_memory(compliance)
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Guess) -> Solution:
         """Solve the complementarity problem; see `ContactSolver.solve`."""
         return self.contact_solver.solve(compliance, offset, resolution, guess)
 
@@ -62,8 +66,12 @@ class ProbedProblem:
         """Return the problem of one step."""
         return replace(self, is_open=self.is_open[step], push=self.push[step])
 
+    def first_guess(self) -> Guess:
+        """Return where the first step starts."""
+        return self.problem.first_guess()
+
     def solve(
-        self, rhs: Array, bound: Array, resolution: Array, guess: Array
+        self, rhs: Array, bound: Array, resolution: Array, guess: Guess
     ) -> tuple[Array, Solution]:
         """Solve the VI of one step; see `ContactProblem.solve`."""
         solver = OpenInDerivative(self.problem.contact_solver, self.is_open)

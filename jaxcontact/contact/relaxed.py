@@ -30,6 +30,7 @@ from jax import Array
 from jaxcontact.contact import complementarity
 from jaxcontact.contact.complementarity import (
     ContactSolver,
+    Guess,
     Solution,
     Status,
     separation,
@@ -64,11 +65,16 @@ class RelaxedContact:
     max_steps: int = field(default=100, metadata={"static": True})
     """Newton steps before a time step ends as not converged."""
 
-    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Array) -> Solution:
+    def first_memory(self, compliance: Array) -> tuple[()]:
+        """Return (): nothing is kept between steps."""
+        return ()
+
+    def solve(self, compliance: Array, offset: Array, resolution: Array, guess: Guess) -> Solution:
         """Solve the relaxed problem; see `ContactSolver.solve`.
 
         Active are the pairs that are nearer to strong contact than to separation, d p > g.
         """
+        closed = guess.active
         diagonal = jnp.diagonal(compliance)
         kappa = jax.lax.stop_gradient(jnp.asarray(self.kappa, offset.dtype))
         scale = jnp.sqrt(diagonal)
@@ -113,7 +119,7 @@ class RelaxedContact:
             patience = jnp.where(size < 0.95 * best, PATIENCE, patience - 1)
             return x, new_error, noise(x), jnp.minimum(best, size), steps + 1, patience
 
-        multiplier = solve_on_set(compliance, guess, None, jnp.where(guess, -offset, 0.0))
+        multiplier = solve_on_set(compliance, closed, None, jnp.where(closed, -offset, 0.0))
         x = diagonal * multiplier - separation(compliance, offset, multiplier)
         error = residual(x)
         start = (x, error, noise(x), merit(error), jnp.int32(0), jnp.int32(PATIENCE))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.contact.complementarity import ContactSolver, solve_on_set
+from jaxcontact.contact.complementarity import ContactSolver, Guess, solve_on_set
 from jaxcontact.linear import Factor
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
@@ -36,8 +36,8 @@ class Fixed(NamedTuple):
     resolution: Array
     """Rounding error of b, (C,)."""
 
-    guess: Array
-    """Active set to start from, (C,) bool."""
+    guess: Guess
+    """Where the contact solver starts."""
 
     contact_solver: ContactSolver
     """How the condensed problem is solved; its parameters count as constant."""

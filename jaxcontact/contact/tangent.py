@@ -51,7 +51,7 @@ def _solve_forward(
             rhs,
             bound,
             fixed.resolution,
-            fixed.guess,
+            fixed.guess.active,
         )
     partial_sweep, free = factor.condense(rhs)
     solution = contact_solver.solve(factor.compliance, bound - free, fixed.resolution, fixed.guess)

@@ -25,10 +25,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact.adjoint import solve_with_adjoint
-from jaxcontact.contact.complementarity import ContactSolver, Solution, Status
+from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
 from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
+from jaxcontact.linear.conjugate_gradient import IterativeFactor
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -53,8 +54,15 @@ class ContactProblem:
     """What the derivative means where a pair is in weak contact. None is Algorithm 1, by the
     `jax.custom_vjp` of the step: reverse mode. A named treatment has forward mode too."""
 
+    def first_guess(self) -> Guess:
+        """Return where the first step starts: no pair is in contact."""
+        nothing = jnp.zeros(self.normals.count, bool)
+        if self.normals.count == 0 or isinstance(self.factor, IterativeFactor):
+            return Guess(nothing)
+        return Guess(nothing, self.contact_solver.first_memory(self.factor.compliance))
+
     def solve(
-        self, rhs: Array, bound: Array, resolution: Array, guess: Array
+        self, rhs: Array, bound: Array, resolution: Array, guess: Guess
     ) -> tuple[Array, Solution]:
         """Solve the VI.
 
@@ -62,7 +70,7 @@ class ContactProblem:
             rhs: r, (n,).
             bound: b, (C,); the admissible normal velocity.
             resolution: rounding error of the bound, (C,); smaller gaps count as closed.
-            guess: active set to start from, (C,) bool.
+            guess: where to start: `first_guess` or the guess of the last step's solution.
 
         Returns:
             w (n,), NaN if the problem was not solved, and the solution on the contact pairs.
@@ -76,7 +84,8 @@ class ContactProblem:
             velocity = _solve_linear(self, rhs)
             is_finite = jnp.all(jnp.isfinite(velocity))
             status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
-            return velocity, Solution(bound, guess, jnp.int32(0), status, jnp.zeros((), rhs.dtype))
+            zero = jnp.zeros((), rhs.dtype)
+            return velocity, Solution(bound, guess.active, jnp.int32(0), status, zero)
         fixed = Fixed(
             self.matrix.columns,
             self.normals.unknowns,
@@ -92,7 +101,10 @@ class ContactProblem:
             velocity, solution = solve_forward(self.weak_contact, *data)
         # Multiplication poisons value and gradient alike; a `where` would leave a zero gradient.
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(velocity.dtype)
-        return velocity * poison, solution._replace(multiplier=solution.multiplier * poison)
+        return velocity * poison, solution._replace(
+            multiplier=solution.multiplier * poison,
+            memory=jax.lax.stop_gradient(solution.memory),
+        )
 
 
 def _solve_linear(problem: ContactProblem, rhs: Array) -> Array:

@@ -45,7 +45,7 @@ class BackwardEuler:
             matrix = matrix + dt * system.viscosity
         return ImplicitOperators(system.mass, make_problem(matrix))
 
-    def memory(self, system: System) -> tuple[()]:
+    def memory(self, system: System, operators: ImplicitOperators) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
@@ -63,10 +63,10 @@ class BackwardEuler:
             operators.mass @ v - dt * (system.stiffness @ y - load),
             bound=(system.gap - system.normals @ y) / dt,
             resolution=gap_resolution(system, y) / dt,
-            guess=state.active,
+            guess=state.guess,
         )
-        new = StepState(y + dt * w, w, solution.multiplier, solution.active)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual)
+        new = StepState(y + dt * w, w, solution.multiplier, solution.guess)
+        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
 
     def energy_flow(
         self,

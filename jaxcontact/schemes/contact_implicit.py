@@ -59,7 +59,7 @@ class ContactImplicit:
             matrix = matrix + 0.5 * dt * system.viscosity
         return ImplicitOperators(system.mass, make_problem(matrix))
 
-    def memory(self, system: System) -> tuple[()]:
+    def memory(self, system: System, operators: ImplicitOperators) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
@@ -78,10 +78,10 @@ class ContactImplicit:
             rhs,
             bound=(system.gap - system.normals @ y) / dt,
             resolution=gap_resolution(system, y) / dt,
-            guess=state.active,
+            guess=state.guess,
         )
-        new = StepState(y + dt * w, 2.0 * w - v, 2.0 * solution.multiplier, solution.active)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual)
+        new = StepState(y + dt * w, 2.0 * w - v, 2.0 * solution.multiplier, solution.guess)
+        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
 
     def energy_flow(
         self,

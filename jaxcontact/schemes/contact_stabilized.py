@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import ContactProblem
+from jaxcontact.contact import ContactProblem, Guess
 from jaxcontact.schemes.contact_implicit import ContactImplicit
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
@@ -66,9 +66,9 @@ class ContactStabilized:
         trapezoidal = ContactImplicit().prepare(system, dt, make_problem)
         return StabilizedOperators(system.mass, make_problem(system.mass), trapezoidal.problem)
 
-    def memory(self, system: System) -> tuple[()]:
-        """Return (): displacement and velocity are all a step needs."""
-        return ()
+    def memory(self, system: System, operators: StabilizedOperators) -> Guess:
+        """Return where the contact problem of the first predictor starts."""
+        return operators.predictor.first_guess()
 
     def step(
         self,
@@ -83,16 +83,17 @@ class ContactStabilized:
         contact = {
             "bound": (system.gap - system.normals @ y) / dt,
             "resolution": gap_resolution(system, y) / dt,
-            "guess": state.active,
         }
-        u, predicted = operators.predictor.solve(operators.mass @ v, **contact)
+        u, predicted = operators.predictor.solve(operators.mass @ v, **contact, guess=state.memory)
         rhs = operators.mass @ u - 0.5 * dt * (system.stiffness @ y - load)
-        w, solution = operators.problem.solve(rhs, **contact)
-        new = StepState(y + dt * w, v + 2.0 * (w - u), 2.0 * solution.multiplier, solution.active)
+        w, solution = operators.problem.solve(rhs, **contact, guess=state.guess)
+        velocity, impulse = v + 2.0 * (w - u), 2.0 * solution.multiplier
+        new = StepState(y + dt * w, velocity, impulse, solution.guess, predicted.guess)
         return new, StepInfo(
             jnp.maximum(predicted.iterations, solution.iterations),
             jnp.maximum(predicted.status, solution.status),
             jnp.maximum(predicted.residual, solution.residual),
+            predicted.weak | solution.weak,
         )
 
     def energy_flow(

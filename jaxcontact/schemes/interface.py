@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
-from jaxcontact.contact import ContactProblem
+from jaxcontact.contact import ContactProblem, Guess
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
 
@@ -24,8 +24,8 @@ class StepState(NamedTuple):
     impulse: Array
     """Contact impulse lam of the last step, (C,) [N s]."""
 
-    active: Array
-    """Active contact pairs of the last step, (C,) bool."""
+    guess: Guess
+    """Where the contact problem starts: the active pairs (C,) bool of the last step, and more."""
 
     memory: Any = ()
     """What else the scheme hands on, see `Scheme.memory`."""
@@ -42,6 +42,9 @@ class StepInfo(NamedTuple):
 
     residual: Array
     """Largest relative KKT residual of the step, scalar."""
+
+    weak: Array
+    """Pairs in weak contact in a contact problem of the step, (C,) bool."""
 
 
 class EnergyFlow(NamedTuple):
@@ -71,7 +74,7 @@ class Scheme(Protocol):
         """Return the operators of the scheme, a pytree with at least `.mass`."""
         ...
 
-    def memory(self, system: System) -> Any:
+    def memory(self, system: System, operators: Any) -> Any:
         """Return what a step must remember beside the state, at the start; () for most schemes."""
         ...
 

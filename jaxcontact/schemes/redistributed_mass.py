@@ -93,7 +93,7 @@ class RedistributedMass:
         problem = make_problem(matrix.to_symmetric(n_nodes))
         return RedistributedOperators(mass.to_symmetric(n_nodes), problem)
 
-    def memory(self, system: System) -> tuple[()]:
+    def memory(self, system: System, operators: RedistributedOperators) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
@@ -117,11 +117,11 @@ class RedistributedMass:
             rhs,
             bound=(system.gap - system.normals @ y) / dt,
             resolution=gap_resolution(system, y) / dt,
-            guess=state.active,
+            guess=state.guess,
         )
         velocity = w + _remove_normal(system, w - v)
-        new = StepState(y + dt * w, velocity, 4.0 * solution.multiplier, solution.active)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual)
+        new = StepState(y + dt * w, velocity, 4.0 * solution.multiplier, solution.guess)
+        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
 
     def energy_flow(
         self,

@@ -46,7 +46,7 @@ class Trapezoidal:
         """Return the operators: D factorised once."""
         return ContactImplicit().prepare(system, dt, make_problem)
 
-    def memory(self, system: System) -> Array:
+    def memory(self, system: System, operators: ImplicitOperators) -> Array:
         """Return the contact force c at the start, (C,) [N]: none."""
         return jnp.zeros(system.normals.count, system.dtype)
 
@@ -65,12 +65,12 @@ class Trapezoidal:
             rhs - 0.25 * dt * system.normals.transposed_product(old_force, system.size),
             bound=(system.gap - system.normals @ y) / dt,
             resolution=gap_resolution(system, y) / dt,
-            guess=state.active,
+            guess=state.guess,
         )
         force = 4.0 / dt * solution.multiplier
         impulse = 0.5 * dt * (old_force + force)
-        new = StepState(y + dt * w, 2.0 * w - v, impulse, solution.active, force)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual)
+        new = StepState(y + dt * w, 2.0 * w - v, impulse, solution.guess, force)
+        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
 
     def energy_flow(
         self,
