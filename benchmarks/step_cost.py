@@ -20,6 +20,7 @@ import speed_scenes
 import jaxcontact as jc
 from jaxcontact.linear import dissection_plan
 from jaxcontact.linear.nested_dissection import NestedDissection
+from jaxcontact.sparse import unknown_columns
 
 SIZES_2D = [500, 2_000, 10_000, 50_000, 200_000]
 SIZES_3D = [3_000, 20_000, 80_000]
@@ -32,7 +33,7 @@ def factor_entries(body: speed_scenes.Body) -> int:
         np.asarray(system.points)[system.free_nodes], system.dimension, axis=0
     ).astype(float)
     plan = dissection_plan.plan_for(
-        system.stiffness.columns,
+        unknown_columns(system.stiffness.columns, system.size),
         system.normals.unknowns,
         coordinates,
         NestedDissection().leaf_size,

@@ -82,23 +82,6 @@ def assemble(pattern: NodePattern, blocks: Array) -> Array:
     return values.reshape(width * n_components, n * n_components)
 
 
-def matrix_columns(pattern: NodePattern, n_components: int) -> np.ndarray:
-    """Return the columns (width * c, n * c) int32 that belong to the values of `assemble`."""
-    component = np.arange(n_components, dtype=np.int32)
-    columns = pattern.columns[:, None, :, None] * n_components + component[:, None, None]
-    columns = np.broadcast_to(columns, (*columns.shape[:3], n_components))
-    width, n = pattern.columns.shape
-    return np.ascontiguousarray(columns.reshape(width * n_components, n * n_components))
-
-
-def repeat_scalar(values: Array, n_components: int) -> Array:
-    """Return the values of a scalar matrix (width, n) acting on each of c components."""
-    width, n = values.shape
-    identity = jnp.eye(n_components, dtype=values.dtype)
-    repeated = values[:, None, :, None] * identity[None, :, None, :]
-    return repeated.reshape(width * n_components, n * n_components)
-
-
 def hat_gradients(points: Array, cells: Array | np.ndarray) -> tuple[Array, Array]:
     """Return hat function gradients (E, d+1, d) [1/m] and cell volumes (E,) [m^d]."""
     corners = points[cells]

@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 from jax.core import Tracer
 
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.system import Basis, System
 
 
@@ -42,7 +42,7 @@ def reduce(system: System, modes: int, *, contact_responses: bool = True) -> Sys
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
-    if isinstance(system.mass.values, Tracer):
+    if isinstance(system.stiffness.values, Tracer):
         raise ValueError(
             "reduce needs concrete matrices, since it computes eigenvectors on the host; call it "
             "outside of jit, grad and vmap"
@@ -52,7 +52,7 @@ def reduce(system: System, modes: int, *, contact_responses: bool = True) -> Sys
     vectors = _basis(system, modes, contact_responses)
     V = jnp.asarray(vectors, system.dtype)
 
-    def project(matrix: SymmetricMatrix) -> SymmetricMatrix:
+    def project(matrix: ComponentwiseMatrix | SymmetricMatrix) -> SymmetricMatrix:
         reduced = V.T @ (matrix @ V)
         return SymmetricMatrix(0.5 * (reduced + reduced.T), None)
 

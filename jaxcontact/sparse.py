@@ -2,13 +2,14 @@
 
 A symmetric matrix is stored in padded ELL layout, column-major: `values[j, i]` sits in row `i`
 and column `columns[j, i]`; rows with fewer entries are padded by their own index and the value
-zero. The product is then a short sum of gathers, without a scatter, and because the matrix is
-symmetric its transpose is the same gather.
+zero. With d components per node, rows and columns count nodes and entries are d x d blocks. The
+product is then a short sum of gathers, without a scatter, and because the matrix is symmetric its
+transpose is the same gather.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,16 @@ from jax import Array
 
 from jaxcontact.symmetric_product import symmetric_product, take
 
-__all__ = ["ContactNormals", "SymmetricMatrix", "take"]
+__all__ = ["ComponentwiseMatrix", "ContactNormals", "SymmetricMatrix", "take", "unknown_columns"]
+
+
+def unknown_columns(columns: Array | np.ndarray, size: int) -> Array | np.ndarray:
+    """Return the column of each entry, (width d, n), from that of each block, (width, n/d)."""
+    width, n_nodes = columns.shape
+    d = size // n_nodes
+    component = np.arange(d, dtype=np.int32)[None, :, None, None]
+    spread = columns[:, None, :, None] * d + component + np.zeros((1, 1, 1, d), np.int32)
+    return spread.reshape(width * d, size)
 
 
 @jax.tree_util.register_dataclass
@@ -30,10 +40,11 @@ class SymmetricMatrix:
     """
 
     values: Array
-    """Entries, (width, n); padded entries are zero. Dense: (n, n)."""
+    """Entries, (width d, n): component j of a column and i of a row at (j, i) of each block;
+    padded entries are zero. Dense: (n, n)."""
 
     columns: Array | np.ndarray | None
-    """Column of each entry, (width, n) int32; padded entries name their own row. None is dense
+    """Column of each block, (width, n/d) int32; padded blocks name their own row. None is dense
     (a reduced model)."""
 
     @property
@@ -51,6 +62,10 @@ class SymmetricMatrix:
         """Return the sum; both matrices must share one sparsity pattern."""
         return SymmetricMatrix(self.values + other.values, self.columns)
 
+    def expand(self) -> SymmetricMatrix:
+        """Return the matrix itself: every entry is there (see `ComponentwiseMatrix`)."""
+        return self
+
     def __rmul__(self, factor: Array | float) -> SymmetricMatrix:
         """Return the matrix scaled by a number."""
         return SymmetricMatrix(factor * self.values, self.columns)
@@ -59,27 +74,73 @@ class SymmetricMatrix:
         """Return the diagonal, (n,)."""
         if self.columns is None:
             return jnp.diagonal(self.values)
-        on_diagonal = self.columns == jnp.arange(self.size, dtype=jnp.int32)[None, :]
+        columns = unknown_columns(self.columns, self.size)
+        on_diagonal = columns == jnp.arange(self.size, dtype=jnp.int32)[None, :]
         return jnp.sum(jnp.where(on_diagonal, self.values, 0.0), axis=0)
 
     def to_dense(self) -> Array:
         """Return the dense matrix, (n, n)."""
         if self.columns is None:
             return self.values
-        rows = jnp.broadcast_to(jnp.arange(self.size, dtype=jnp.int32)[None, :], self.columns.shape)
+        columns = unknown_columns(self.columns, self.size)
+        rows = jnp.broadcast_to(jnp.arange(self.size, dtype=jnp.int32)[None, :], columns.shape)
         zeros = jnp.zeros((self.size, self.size), self.values.dtype)
-        return zeros.at[rows, self.columns].add(self.values)
+        return zeros.at[rows, columns].add(self.values)
 
     def to_scipy(self) -> scipy.sparse.csr_array:
         """Return a SciPy CSR copy (concrete matrices only)."""
         if self.columns is None:
             return scipy.sparse.csr_array(np.asarray(self.values))
-        values, columns = np.asarray(self.values), np.asarray(self.columns)
+        values = np.asarray(self.values)
+        columns = unknown_columns(np.asarray(self.columns), self.size)
         rows = np.broadcast_to(np.arange(self.size, dtype=np.int32), columns.shape)
         entries = (values.ravel(), (rows.ravel(), columns.ravel()))
         matrix = scipy.sparse.coo_array(entries, shape=(self.size, self.size)).tocsr()
         matrix.eliminate_zeros()
         return matrix
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ComponentwiseMatrix:
+    """A symmetric matrix (n, n) that acts alike on each of d components and couples none.
+
+    A mass matrix is one; it is stored and multiplied in n / d rows.
+    """
+
+    scalar: SymmetricMatrix
+    """The action on one component, (n/d, n/d)."""
+
+    dimension: int = field(metadata={"static": True})
+    """Number of components, d."""
+
+    @property
+    def size(self) -> int:
+        """Number of rows, n."""
+        return self.scalar.size * self.dimension
+
+    def __matmul__(self, x: Array) -> Array:
+        """Return the product with a vector (n,) or with the columns of a matrix (n, r)."""
+        return (self.scalar @ x.reshape(self.scalar.size, -1)).reshape(x.shape)
+
+    def __add__(self, other: SymmetricMatrix) -> SymmetricMatrix:
+        """Return the sum with a matrix of d x d blocks on the same nodes."""
+        return self.expand() + other
+
+    def expand(self) -> SymmetricMatrix:
+        """Return the matrix with all entries of its blocks, those between components zero."""
+        n_nodes, d = self.scalar.size, self.dimension
+        identity = jnp.eye(d, dtype=self.scalar.values.dtype)
+        blocks = self.scalar.values[:, None, :, None] * identity[None, :, None, :]
+        return SymmetricMatrix(blocks.reshape(-1, n_nodes * d), self.scalar.columns)
+
+    def diagonal(self) -> Array:
+        """Return the diagonal, (n,)."""
+        return jnp.repeat(self.scalar.diagonal(), self.dimension)
+
+    def to_scipy(self) -> scipy.sparse.csr_array:
+        """Return a SciPy CSR copy (concrete matrices only)."""
+        return self.expand().to_scipy()
 
 
 @jax.tree_util.register_dataclass

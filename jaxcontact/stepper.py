@@ -100,7 +100,7 @@ def prepare(
             raise ValueError(f"{name} must be an object, such as jc.{example}(), got {option!r}")
     if not isinstance(dt, Tracer) and not (np.isfinite(dt) and np.asarray(dt) > 0.0):
         raise ValueError(f"dt must be a positive number of seconds, got {dt}")
-    if isinstance(system.mass.columns, Tracer):
+    if isinstance(system.stiffness.columns, Tracer):
         raise ValueError(
             "the sparsity pattern of the system is traced; call prepare outside jax.jit, or build "
             "mesh and scene inside the transformed function so that only values are traced"

@@ -1,11 +1,11 @@
 """The product with a sparse symmetric matrix, as a primitive that knows its own transpose.
 
-    y_i = sum_j values[j, i] x[columns[j, i]]
+    y_i = sum_j values[j, i] x[columns[j, i]],
 
-is bilinear in entries and vector. Its transpose by x is the same product, because the matrix is
-symmetric, and its transpose by the entries is an outer product on the sparsity pattern; plain
-autodiff would turn the gathers into scatter-adds. Being a primitive, it has every order and mode of
-differentiation.
+each entry a block of d x d components, is bilinear in entries and vector. Its transpose by x is the
+same product, because the matrix is symmetric, and its transpose by the entries is an outer product
+on the sparsity pattern; plain autodiff would turn the gathers into scatter-adds. Being a primitive,
+it has every order and mode of differentiation.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def symmetric_product(values: Array, columns: Array | np.ndarray, x: Array) -> A
     """Return the product of a symmetric matrix in padded ELL layout with a vector or a matrix.
 
     Args:
-        values: entries, (width, n).
-        columns: column of each entry, (width, n) int32.
+        values: entries, (width d, n): component j of a column and i of a row at (j, i) of a block.
+        columns: column of each block, (width, n/d) int32; the quotient of the shapes gives d.
         x: vector (n,) or columns (n, r).
 
     Derivative: of any order, with respect to x and to the entries. Tangents of the entries must be
@@ -40,17 +40,20 @@ def symmetric_product(values: Array, columns: Array | np.ndarray, x: Array) -> A
 
 
 def outer_on_pattern(columns: Array | np.ndarray | None, left: Array, right: Array) -> Array:
-    """Return left_i right_j on a sparsity pattern, (width, n): the cotangent of the entries.
+    """Return left_i right_j on a sparsity pattern, (width d, n): the cotangent of the entries.
 
     Args:
-        columns: column of each entry, (width, n) int32; None is dense.
+        columns: column of each block, (width, n/d) int32; None is dense.
         left: vector (n,) or columns (n, r), which are summed.
         right: like left.
     """
     if columns is None:
         return jnp.outer(left, right) if left.ndim == 1 else left @ right.T
-    outer = left[None] * take(right, columns)
-    return jnp.sum(outer, axis=2) if left.ndim == 2 else outer
+    n, n_nodes = left.shape[0], columns.shape[1]
+    left, right = (x.reshape(n_nodes, n // n_nodes, -1) for x in (left, right))
+    right = jnp.swapaxes(take(right, columns), 1, 2)  # (slot, column component, row, r)
+    outer = jnp.sum(right[:, :, :, None] * left[None, None], axis=-1)
+    return outer.reshape(-1, n)
 
 
 def take(x: Array, index: Array | np.ndarray) -> Array:
@@ -60,14 +63,17 @@ def take(x: Array, index: Array | np.ndarray) -> Array:
 
 def _gathered_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
     """Return sum_j values[j] * x[columns[j]]; the loop over the short rows is unrolled."""
-    if x.ndim == 2:
-        values = values[:, :, None]
+    width, n_nodes = columns.shape
+    d = values.shape[1] // n_nodes
     # Without the barrier XLA recomputes the producer of x inside every one of the gathers.
-    x = jax.lax.optimization_barrier(x)
-    product = values[0] * take(x, columns[0])
-    for j in range(1, columns.shape[0]):
-        product = product + values[j] * take(x, columns[j])
-    return product
+    nodal = jax.lax.optimization_barrier(x).reshape(n_nodes, d, *x.shape[1:])
+    blocks = values.reshape(width, d, n_nodes, d, *(1 for _ in x.shape[1:]))
+    product = jnp.zeros((), x.dtype)
+    for j in range(width):
+        neighbour = take(nodal, columns[j])
+        for component in range(d):
+            product = product + blocks[j, component] * neighbour[:, component : component + 1]
+    return product.reshape(x.shape)
 
 
 def _jvp(primals, tangents, *, is_transposed):

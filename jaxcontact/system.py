@@ -20,7 +20,7 @@ from jaxcontact import assembly
 from jaxcontact.material import KelvinVoigt
 from jaxcontact.obstacle import gap_and_normals
 from jaxcontact.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
 
 @jax.tree_util.register_dataclass
@@ -40,8 +40,8 @@ class Basis:
 class System:
     """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
 
-    mass: SymmetricMatrix
-    """M, consistent mass matrix with density, (n, n) [kg]."""
+    mass: ComponentwiseMatrix | SymmetricMatrix
+    """M, consistent mass matrix with density, (n, n) [kg]; dense in a reduced model."""
 
     stiffness: SymmetricMatrix
     """A, elastic stiffness matrix, (n, n) [N/m]."""
@@ -49,7 +49,7 @@ class System:
     viscosity: SymmetricMatrix | None
     """B, viscosity matrix, (n, n) [N s/m]; None if the material has no viscosity."""
 
-    l2_mass: SymmetricMatrix
+    l2_mass: ComponentwiseMatrix | SymmetricMatrix
     """L on the unknowns: mass matrix without density, (n, n) [m^d]."""
 
     nodal_mass: SymmetricMatrix
@@ -157,7 +157,6 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
 
     pattern = assembly.node_pattern(cells, numbers)
     all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
-    columns = assembly.matrix_columns(pattern, dimension)
     values = _assemble(
         points,
         cells,
@@ -172,11 +171,14 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     components = np.arange(dimension, dtype=np.int32)
     unknowns = numbers[nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
+    def on_free(values: Array) -> SymmetricMatrix:
+        return SymmetricMatrix(values, pattern.columns)
+
     return System(
-        mass=SymmetricMatrix(values.mass, columns),
-        stiffness=SymmetricMatrix(values.stiffness, columns),
-        viscosity=None if values.viscosity is None else SymmetricMatrix(values.viscosity, columns),
-        l2_mass=SymmetricMatrix(values.l2_mass, columns),
+        mass=ComponentwiseMatrix(on_free(values.mass), dimension),
+        stiffness=on_free(values.stiffness),
+        viscosity=None if values.viscosity is None else on_free(values.viscosity),
+        l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
         normals=ContactNormals(vectors, unknowns),
         gap=gap,
@@ -191,7 +193,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
 
 
 class _Values(NamedTuple):
-    """Entries of the matrices in ELL layout, and the nodal load (N, d)."""
+    """Entries of the matrices in ELL layout, those of the masses scalar; nodal load (N, d)."""
 
     mass: Array
     stiffness: Array
@@ -219,9 +221,6 @@ def _assemble(
     l2_blocks = assembly.mass_blocks(volumes, dimension)
     density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
 
-    def vector_mass(blocks: Array) -> Array:
-        return assembly.repeat_scalar(assembly.assemble(pattern, blocks), dimension)
-
     def isotropic(lame: tuple) -> Array:
         blocks = assembly.stiffness_blocks(gradients, volumes, lame)
         return assembly.assemble(pattern, blocks)
@@ -234,10 +233,10 @@ def _assemble(
     for facets, traction in tractions.values():
         load = load + assembly.nodal_areas(points, facets)[:, None] * traction[None, :]
     return _Values(
-        mass=vector_mass(density[:, None, None, None, None] * l2_blocks),
+        mass=assembly.assemble(pattern, density[:, None, None, None, None] * l2_blocks),
         stiffness=isotropic(material.elastic_lame()),
         viscosity=None if is_elastic else isotropic(material.viscous_lame()),
-        l2_mass=vector_mass(l2_blocks),
+        l2_mass=assembly.assemble(pattern, l2_blocks),
         nodal_mass=assembly.assemble(all_nodes, l2_blocks),
         load=load,
     )

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
 # Sums of a few products of numbers of order one: a few units of the last place.
 ROUNDING = 1e-13
@@ -175,3 +175,61 @@ def test_contact_normals_gradient_by_the_vector_is_the_transpose():
     p = jnp.asarray(np.random.default_rng(8).normal(size=4))
     gradient = jax.grad(lambda y: jnp.dot(p, normals @ y))(jnp.ones(8))
     np.testing.assert_allclose(gradient, normals.transposed_product(p, 8), atol=ROUNDING)
+
+
+def random_blocks(d, n_nodes=6):
+    """A random symmetric matrix of d x d blocks, dense and as ELL; rows of different lengths"""
+    pattern, scalar = random_symmetric(n_nodes)
+    rng = np.random.default_rng(d)
+    dense = rng.normal(size=(n_nodes, d, n_nodes, d)) * (pattern != 0)[:, None, :, None]
+    dense = dense + dense.transpose(2, 3, 0, 1)
+    columns = np.asarray(scalar.columns)
+    values = np.zeros((len(columns), d, n_nodes, d))
+    for row in range(n_nodes):
+        for slot in range(np.count_nonzero(pattern[row])):
+            values[slot, :, row] = dense[row, :, columns[slot, row]].T
+    matrix = SymmetricMatrix(jnp.asarray(values.reshape(-1, n_nodes * d)), scalar.columns)
+    return dense.reshape(n_nodes * d, n_nodes * d), matrix
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_matrix_of_blocks_is_the_dense_one(d):
+    dense, matrix = random_blocks(d)
+    x = np.random.default_rng(1).normal(size=(6 * d, 4))
+    np.testing.assert_allclose(matrix @ jnp.asarray(x[:, 0]), dense @ x[:, 0], atol=ROUNDING)
+    np.testing.assert_allclose(matrix @ jnp.asarray(x), dense @ x, atol=ROUNDING)
+    many = jax.vmap(lambda x: matrix @ x, in_axes=1, out_axes=1)(jnp.asarray(x))
+    np.testing.assert_allclose(many, dense @ x, atol=ROUNDING)
+    np.testing.assert_array_equal(matrix.to_dense(), dense)
+    np.testing.assert_array_equal(matrix.to_scipy().toarray(), dense)
+    np.testing.assert_array_equal(matrix.diagonal(), np.diagonal(dense))
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("r", [None, 2])
+def test_gradient_by_the_entries_of_blocks_is_the_outer_product_on_the_pattern(d, r):
+    _, matrix = random_blocks(d)
+    shape = (6 * d,) if r is None else (6 * d, r)
+    x, y = jnp.asarray(np.random.default_rng(2).normal(size=(2, *shape)))
+
+    def product(values):
+        return jnp.sum(y * (SymmetricMatrix(values, matrix.columns) @ x))
+
+    def dense_product(values):
+        return jnp.sum(y * (SymmetricMatrix(values, matrix.columns).to_dense() @ x))
+
+    np.testing.assert_allclose(
+        jax.grad(product)(matrix.values), jax.grad(dense_product)(matrix.values), atol=ROUNDING
+    )
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_componentwise_matrix_is_the_kronecker_product_with_the_identity(d):
+    scalar_dense, scalar = random_symmetric()
+    dense, matrix = np.kron(scalar_dense, np.eye(d)), ComponentwiseMatrix(scalar, d)
+    x = np.random.default_rng(1).normal(size=(7 * d, 4))
+    np.testing.assert_allclose(matrix @ jnp.asarray(x[:, 0]), dense @ x[:, 0], atol=ROUNDING)
+    np.testing.assert_allclose(matrix @ jnp.asarray(x), dense @ x, atol=ROUNDING)
+    np.testing.assert_array_equal(matrix.to_scipy().toarray(), dense)
+    np.testing.assert_array_equal(matrix.diagonal(), np.diagonal(dense))
+    np.testing.assert_array_equal((matrix + matrix.expand()).to_dense(), 2.0 * dense)

@@ -27,7 +27,7 @@ from jax import Array
 
 from jaxcontact.linear.dissection_numeric import condense_root, factorize_fronts
 from jaxcontact.linear.dissection_plan import plan_for
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix, take
+from jaxcontact.sparse import ContactNormals, SymmetricMatrix, take, unknown_columns
 
 
 class FrontBatch(NamedTuple):
@@ -136,7 +136,8 @@ class NestedDissection:
         Raises:
             ValueError: if the pattern of `matrix` or `normals` or the coordinates are traced.
         """
-        plan = plan_for(matrix.columns, normals.unknowns, coordinates, self.leaf_size)
+        columns = unknown_columns(matrix.columns, matrix.values.shape[1])
+        plan = plan_for(columns, normals.unknowns, coordinates, self.leaf_size)
         blocks, inverse, is_positive = factorize_fronts(matrix.values, plan.stages)
         places = jnp.asarray(plan.contact_places)
         response, compliance = condense_root(inverse, normals.weights, places)

@@ -66,20 +66,15 @@ class BlockMatrix(NamedTuple):
         nodes[slots, rows] = columns
         blocks = scatter(self.blocks[order], slots * n_nodes + rows, width * n_nodes)
         blocks = blocks.reshape(width, n_nodes, d, d)  # (slot, row, i, j)
-        component = np.arange(d)[None, :, None, None]
-        indices = np.broadcast_to(
-            nodes[:, None, :, None] * d + component, (width, d, n_nodes, d)
-        ).reshape(width * d, n_nodes * d)
         values = blocks.transpose(0, 3, 1, 2).reshape(width * d, n_nodes * d)
-        return SymmetricMatrix(jnp.asarray(values), np.ascontiguousarray(indices, np.int32))
+        return SymmetricMatrix(jnp.asarray(values), nodes.astype(np.int32))
 
 
 def from_symmetric(matrix: SymmetricMatrix, dimension: int) -> BlockMatrix:
     """Return a matrix that was assembled from nodal blocks (d, d) as a block matrix."""
     d, n_nodes = dimension, matrix.size // dimension
-    columns = np.asarray(matrix.columns)
-    width = columns.shape[0] // d
-    nodes = columns.reshape(width, d, n_nodes, d)[:, 0, :, 0] // d
+    nodes = np.asarray(matrix.columns)
+    width = nodes.shape[0]
     blocks = (
         on_host(matrix.values).reshape(width, d, n_nodes, d).transpose(0, 2, 3, 1)
     )  # (slot, row, i, j)

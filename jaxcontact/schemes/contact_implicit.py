@@ -20,7 +20,7 @@ from jax import Array
 from jaxcontact.contact import ContactProblem
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.sparse import SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system import System
 
 
@@ -29,7 +29,7 @@ from jaxcontact.system import System
 class ImplicitOperators:
     """Operators of a scheme with one contact problem per step."""
 
-    mass: SymmetricMatrix
+    mass: ComponentwiseMatrix | SymmetricMatrix
     """Mass matrix of the kinetic energy, (n, n) [kg]."""
 
     problem: ContactProblem

@@ -22,7 +22,7 @@ from jaxcontact.contact import ContactProblem, Guess
 from jaxcontact.schemes.contact_implicit import ContactImplicit
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.sparse import SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system import System
 
 
@@ -31,7 +31,7 @@ from jaxcontact.system import System
 class StabilizedOperators:
     """Operators of a scheme with a predictor in the norm of the mass."""
 
-    mass: SymmetricMatrix
+    mass: ComponentwiseMatrix | SymmetricMatrix
     """Mass matrix of the kinetic energy, (n, n) [kg]."""
 
     predictor: ContactProblem
@@ -64,7 +64,8 @@ class ContactStabilized:
     ) -> StabilizedOperators:
         """Return the operators: M and D factorised once."""
         trapezoidal = ContactImplicit().prepare(system, dt, make_problem)
-        return StabilizedOperators(system.mass, make_problem(system.mass), trapezoidal.problem)
+        predictor = make_problem(system.mass.expand())
+        return StabilizedOperators(system.mass, predictor, trapezoidal.problem)
 
     def memory(self, system: System, operators: StabilizedOperators) -> Guess:
         """Return where the contact problem of the first predictor starts."""

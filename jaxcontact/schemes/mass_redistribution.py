@@ -46,7 +46,7 @@ def redistribute(system: System) -> BlockMatrix:
     """
     _check_pairs(system)
     inward = _inward_shift(system)
-    mass = inward.transpose() @ from_symmetric(system.mass, system.dimension) @ inward
+    mass = inward.transpose() @ from_symmetric(system.mass.expand(), system.dimension) @ inward
     corrected = mass.plus(_moment_correction(system, mass))
     _check_semidefinite(system, corrected)
     return corrected
@@ -111,7 +111,7 @@ def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     free = np.asarray(system.free_nodes)
     inside = np.flatnonzero(~np.isin(free, np.asarray(system.contact_nodes)))
     fields = _rigid_fields(on_host(system.points)[free])  # (n, i, k)
-    lost = from_symmetric(system.mass, system.dimension).plus(mass.scaled(-1.0))
+    lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
     columns = fields[lost.columns]
     missing = (fields[lost.rows].swapaxes(1, 2) @ lost.blocks @ columns).sum(axis=0)
     volumes = on_host(system.nodal_mass.values).sum(axis=0)[free[inside]]
