@@ -1,4 +1,4 @@
-"""The dense inverse: the fastest solver for a few hundred unknowns and for reduced models."""
+"""The dense inverse: for up to a few hundred unknowns and for reduced models."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ class DissectionFactor:
 
 @dataclass(frozen=True)
 class NestedDissection:
-    """Factorise by nested dissection: for meshes of a few hundred to some 100 000 unknowns.
+    """Factorise by nested dissection: for meshes of some hundred to some 100 000 unknowns.
 
     The ordering and the index maps are found once per sparsity pattern on the host and kept.
     """
