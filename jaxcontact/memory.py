@@ -96,7 +96,7 @@ def estimate_memory(
     n_records = steps // save_every
 
     trajectory = (n_records + 1) * (2 * field + vector + pairs + item)
-    trajectory += steps * (pairs + n_pairs + 8 + item)
+    trajectory += steps * (pairs + 2 * n_pairs + 8 + item)
     residuals = cotangents = 0
     if gradient or matrix_gradient:
         per_step = n_pairs + item

@@ -52,21 +52,20 @@ class Trajectory:
     residual: Array
     """KKT residual of each step relative to the largest violation of its free motion, (T,)."""
 
+    weak: Array
+    """Pairs in weak contact, closed without a force, in a contact problem of the step, (T, C) bool.
+
+    There the motion has one-sided derivatives only. Gap and force count as zero below the rounding
+    of the step's contact problem (`contact.complementarity.tolerance`). `derivative_report` lists
+    what is nearly weak. `ContactStabilized` has two contact problems: its predictor may be in weak
+    contact while the pair is open at the end of the step. `Trapezoidal` records the mean impulse of
+    two times, but it is the force at the new time that decides here.
+    """
+
     @property
     def strong(self) -> Array:
-        """Pairs in strong contact at the end of the step, (T, C) bool: closed under an impulse."""
-        return self.active & (self.contact_impulse > 0.0)
-
-    @property
-    def weak(self) -> Array:
-        """Pairs in weak contact at the end of the step, (T, C) bool: closed without an impulse.
-
-        There the motion has one-sided derivatives only. Gap and impulse count as zero below the
-        rounding of the step's contact problem (`contact.complementarity.tolerance`); the impulse
-        then is exactly zero. `derivative_report` lists what is nearly weak. The scheme
-        `Trapezoidal` records an impulse averaged over two times, which is not judged right here.
-        """
-        return self.active & ~(self.contact_impulse > 0.0)
+        """Pairs in strong contact at the end of the step, (T, C) bool: closed under a force."""
+        return self.active & ~self.weak
 
     @property
     def final(self) -> State:

@@ -63,15 +63,54 @@ def test_directional_derivative_is_the_one_sided_quotient_at_weak_contact(dimens
     assert error <= 1e-12 / t + FIRST_ORDER * t
 
 
+def test_trajectory_shows_weak_contact_after_strong_contact_with_averaged_forces():
+    # A mass at rest at a wall: under a constant load of excess f the forces are 2 f, 0, 2 f, 0, ...
+    scene = jc.Scene(
+        jc.meshes.interval(1.0, h=1.0),
+        jc.KelvinVoigt(young=4.0, poisson=0.0, density=3.0),
+        clamped=("right",),
+        contact={"left": jc.HalfSpace(np.array([-0.1]), np.ones(1))},
+    )
+    stepper = jc.prepare(jc.discretize(scene), 0.2, scheme=jc.Trapezoidal())
+    control = jnp.zeros((2, 2, 1)).at[:, 0, 0].set(-3.0)
+    rest = jnp.zeros((2, 1))
+    initial = jc.State(rest.at[0].set(-0.1), rest)
+    trajectory = jc.simulate(stepper, control, initial=initial)
+    assert np.all(trajectory.contact_impulse > 0.0)
+    assert np.all(trajectory.active)
+    np.testing.assert_array_equal(trajectory.weak, [[False], [True]])
+    np.testing.assert_array_equal(trajectory.strong, [[True], [False]])
+    pull = jnp.zeros_like(control).at[1, 0, 0].set(1.0)
+    away, press = (
+        jc.directional_derivative(stepper, control, s * pull, initial=initial).velocity[-1, 0, 0]
+        for s in (1.0, -1.0)
+    )
+    assert float(away) > 0.0
+    assert abs(float(press)) <= ROUNDING * float(away)
+
+
+def test_trajectory_shows_weak_contact_of_the_predictor():
+    stepper, control, initial, place = grazing(1, jc.ContactStabilized())
+    trajectory = jc.simulate(stepper, control, initial=initial)
+    assert not np.any(trajectory.active)
+    np.testing.assert_array_equal(np.argwhere(trajectory.weak), [place])
+
+
+@pytest.mark.parametrize("dimension", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scheme", SCHEMES[1:], ids=lambda s: type(s).__name__)
-def test_directional_derivative_is_the_one_sided_quotient_for_every_scheme(scheme):
-    stepper, control, initial, _ = grazing(2, scheme)
+def test_directional_derivative_is_the_one_sided_quotient_for_every_scheme(scheme, dimension):
+    stepper, control, initial, place = grazing(dimension, scheme)
+    trajectory = jc.simulate(stepper, control, initial=initial)
+    np.testing.assert_array_equal(np.argwhere(trajectory.weak), [place])
+    velocities = []
     for sign in (1.0, -1.0):
         direction = sign * direction_of(control)
         derivative = jc.directional_derivative(stepper, control, direction, initial=initial)
         t = 1e-6
         error = largest_error(quotient(stepper, control, initial, direction, t), derivative)
         assert error <= 1e-11 / t + FIRST_ORDER * t, sign
+        velocities.append(derivative.velocity)
+    assert np.max(np.abs(sum(velocities))) > 1e-3 * np.max(np.abs(velocities[0])), "no kink"
 
 
 def test_directional_derivative_is_positively_homogeneous():

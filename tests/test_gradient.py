@@ -122,7 +122,7 @@ def test_gradient_keeps_one_boolean_per_contact_node_and_step(problem, control):
         [
             *((n_steps, problem.system.size, "float64"),) * 2,  # displacement and velocity
             (n_steps, n_pairs, "float64"),  # impulse
-            (n_steps, n_pairs, "bool"),  # active
+            *((n_steps, n_pairs, "bool"),) * 2,  # active and weak
             *((n_steps, str(x.dtype)) for x in (recorded.iterations, recorded.status)),
             (n_steps, str(recorded.residual.dtype)),
         ],

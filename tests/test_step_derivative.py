@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
-from jaxcontact.contact import ContactProblem, Status
+from jaxcontact.contact import ContactProblem, Guess, Status
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix
 
 N_UNKNOWNS, N_PAIRS = 8, 4
@@ -47,7 +47,7 @@ def solve(matrix, weights, rhs, bound, solver=SOLVERS[0], weak_contact=None):
     factor = jc.Dense().factorize(*jax.lax.stop_gradient((symmetric, normals)))
     problem = ContactProblem(symmetric, normals, factor, solver, weak_contact)
     nothing = jnp.zeros(N_PAIRS)
-    w, solution = problem.solve(rhs, bound, nothing, nothing > 0)
+    w, solution = problem.solve(rhs, bound, nothing, Guess(nothing > 0))
     return w, solution.multiplier, solution.active, solution.status
 
 
@@ -175,6 +175,24 @@ def test_step_under_vmap_equals_the_loop_with_its_gradients():
         np.testing.assert_allclose(gradients[k], gradient, atol=ROUNDING)
 
 
+def test_step_gradients_by_different_data_of_one_compiled_program_do_not_mix():
+    # JAX reads the residuals of a step by the pattern of the last gradient that was traced.
+    data = random_data()
+    compiled = jax.jit(lambda scale, *data: scale * weighted(*data))
+
+    def gradient(arguments):
+        return jax.grad(compiled, arguments)(1.0, *data)
+
+    gradient((3,))
+    by_matrix, by_normals = gradient((1, 2))
+    _, by_rhs = gradient((0, 3))
+    z, m, w, p, _ = adjoint(data)
+    np.testing.assert_allclose(by_rhs, z, atol=ROUNDING)
+    np.testing.assert_allclose(by_matrix, -(np.outer(z, w) + np.outer(w, z)) / 2, atol=ROUNDING)
+    expected = np.take_along_axis(-(np.outer(p, z) + np.outer(m, w)), UNKNOWNS, axis=1)
+    np.testing.assert_allclose(by_normals, expected, atol=ROUNDING)
+
+
 def test_step_without_active_pairs_has_the_gradient_of_the_free_motion():
     matrix, weights, rhs, bound = random_data()
     gradient = jax.grad(lambda r: jnp.sum(solve(matrix, weights, r, bound + 100.0)[0]))(rhs)
@@ -206,7 +224,7 @@ def test_step_gradient_in_weak_contact_counts_it_as_strong():
 
     def normal_velocity(r):
         resolution = jnp.full(N_PAIRS, 1e-13)
-        w, solution = problem.solve(r, touching, resolution, jnp.zeros(N_PAIRS, bool))
+        w, solution = problem.solve(r, touching, resolution, Guess(jnp.zeros(N_PAIRS, bool)))
         return operator @ w, solution.active
 
     jacobian, active = jax.jacrev(normal_velocity, has_aux=True)(rhs)
@@ -242,7 +260,8 @@ def test_step_without_contact_pairs_is_a_linear_solve_with_its_gradients():
         nothing = ContactNormals(jnp.zeros((0, 2)), jnp.zeros((0, 2), jnp.int32))
         factor = jc.Dense().factorize(jax.lax.stop_gradient(symmetric), nothing)
         problem = ContactProblem(symmetric, nothing, factor, SOLVERS[0])
-        w, solution = problem.solve(rhs, jnp.zeros(0), jnp.zeros(0), jnp.zeros(0, bool))
+        guess = Guess(jnp.zeros(0, bool))
+        w, solution = problem.solve(rhs, jnp.zeros(0), jnp.zeros(0), guess)
         return jnp.sum(jnp.sin(w)), (w, solution.status)
 
     (by_matrix, by_rhs), (w, status) = jax.grad(total, (0, 1), has_aux=True)(matrix, rhs)

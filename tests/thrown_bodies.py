@@ -92,26 +92,22 @@ def cost(trajectory):
 
 
 @cache
-def compiled(dimension, scheme=None, obstacle="plane", fixed=()):
-    """Values, cost and its gradient by all values but the fixed ones
-
-    Under jit, where also the fixed values would be traced, only if there are none.
-    """
+def compiled(dimension, scheme=None, obstacle="plane"):
+    """Values, cost and its gradient by all values"""
     values = parameters(dimension, obstacle)
-    still = {name: values.pop(name) for name in fixed}
 
     def value(values):
-        return cost(motion(dimension, values | still, scheme))
+        return cost(motion(dimension, values, scheme))
 
-    compile_ = (lambda f: f) if fixed else jax.jit
-    return values, compile_(value), compile_(jax.grad(value))(values)
+    return values, jax.jit(value), jax.jit(jax.grad(value))(values)
 
 
 def grazing(dimension, scheme=None):
     """A motion with one weak contact: stepper, control, initial state, (step, pair)
 
     The body is slowed down and pushed back in free flight. The gap of every pair is set to the
-    largest normal displacement of that flight, so that it touches once, without an impulse.
+    largest normal displacement of that flight, so that it touches once, without an impulse. With
+    `ContactStabilized` it is the predictor y + dt v that touches, the body itself stays open.
     """
     mesh, e = MESHES[dimension], up(dimension)
     rng = np.random.default_rng(dimension)
@@ -125,8 +121,10 @@ def grazing(dimension, scheme=None):
     control = jnp.asarray(12.0 * e + 0.3 * rng.normal(size=(STEPS, *shape)))
     initial = jc.State(jnp.zeros(shape), jnp.asarray(np.broadcast_to(-e, shape)))
     flight = jc.simulate(jc.prepare(system, DT, scheme=scheme), control, initial=initial)
-    unknowns = system.restrict(flight.displacement)
-    normal = np.asarray(jax.vmap(lambda y: system.normals @ y)(unknowns))[1:]
+    reached = flight.displacement[1:]
+    if isinstance(scheme, jc.ContactStabilized):
+        reached = flight.displacement[:-1] + DT * flight.velocity[:-1]
+    normal = np.asarray(jax.vmap(lambda y: system.normals @ y)(system.restrict(reached)))
     place = np.unravel_index(normal.argmax(), normal.shape)
     system = replace(system, gap=jnp.full(normal.shape[1], normal.max()))
     return jc.prepare(system, DT, scheme=scheme), control, initial, place

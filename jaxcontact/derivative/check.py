@@ -5,7 +5,8 @@ Along a direction d the remainders of a correct derivative J'(u) d,
     R+(h) = J(u + h d) - J(u) - h J'(u) d,    R-(h) = J(u - h d) - J(u) + h J'(u) d,
 
 fall like h^2, on both sides where J is differentiable and on one side at a kink; those of a wrong
-one fall like h. Remainders within the rounding of J say nothing and are left out.
+one fall like h, those across a jump not at all. Remainders within the rounding of J say nothing and
+are left out; if that leaves nothing, the check is undecided.
 """
 
 from __future__ import annotations
@@ -27,6 +28,12 @@ NOISE = 64.0
 #: Orders that count as second order.
 SECOND_ORDER = 1.8
 
+#: Remainders that fall by less than this order over all steps are those of a jump.
+NO_ORDER = 0.5
+
+#: A relative error of J' that rounding may hide before the check is undecided.
+COARSEST = 1e-2
+
 
 @dataclass(frozen=True)
 class GradientCheck:
@@ -39,7 +46,7 @@ class GradientCheck:
     """Step lengths h, (H,), falling by factors of two."""
 
     derivative: np.ndarray
-    """J'(u) d by the gradient, (D,); the first direction is the gradient itself."""
+    """J'(u) d by the gradient, (D,); the first direction is the gradient, by the scale of u."""
 
     remainder: np.ndarray
     """|R+| and |R-|, (D, 2, H)."""
@@ -48,7 +55,8 @@ class GradientCheck:
     """|[J(u + h d) - J(u - h d)] / (2h) - J'(u) d|, (D, H)."""
 
     order: np.ndarray
-    """Order of R+ and R- at small steps, (D, 2); infinite if R is rounding, for J affine there."""
+    """Order of R+ and R- at small steps, (D, 2); infinite if R is rounding: J is affine there, or
+    rounding hides its change, see `resolution`."""
 
     noise: float
     """Size below which a remainder is rounding."""
@@ -65,13 +73,23 @@ class GradientCheck:
     @property
     def is_right(self) -> bool:
         """Whether the gradient is the derivative, on both sides and along every direction."""
-        return bool(np.all(self.order >= SECOND_ORDER))
+        return self.verdict.startswith(("RIGHT", "CONSTANT"))
 
     @property
     def central_relative_error(self) -> np.ndarray:
-        """Smallest error of the central differences relative to the derivative, (D,)."""
-        scale = np.maximum(np.abs(self.derivative), np.finfo(float).tiny)
-        return np.min(self.central_error, axis=1) / scale
+        """Smallest error of the central differences relative to the derivative, (D,).
+
+        Absolute where the derivative is zero.
+        """
+        return np.min(self.central_error, axis=1) / _scale(self.derivative)
+
+    @property
+    def resolution(self) -> np.ndarray:
+        """Relative error of the derivative that the remainders cannot exclude, (D,).
+
+        Absolute where the derivative is zero.
+        """
+        return _resolution(self.remainder, self.steps, self.derivative, self.noise)
 
     def __str__(self) -> str:
         """Return the table of remainders and the verdict."""
@@ -114,8 +132,8 @@ def check_gradient(
         u: an array, or a pytree of arrays such as the parameters of a network.
         gradient: what to check, shaped like u; default `jax.grad(objective)(u)`.
         directions: number of random directions beside the gradient.
-        step: largest step, relative to the norm of u (absolute if u is zero).
-        n_steps: number of steps, each half of the one before.
+        step: largest step, relative to the norm of every array in u (absolute for a zero array).
+        n_steps: number of steps, each half of the one before, at least 2.
         seed: of the random directions.
         trajectory: maps u to the trajectory, to count weak contact.
 
@@ -123,22 +141,31 @@ def check_gradient(
         Remainders, orders and a verdict; print it.
 
     Raises:
-        ValueError: if the objective is not a scalar.
+        ValueError: if the objective is not a scalar or the gradient not shaped like u.
     """
     flat, unravel = ravel_pytree(u)
     shape = jax.eval_shape(objective, u)
     if getattr(shape, "shape", None) != ():
         raise ValueError(f"the objective must return one scalar, got {shape}")
+    if n_steps < 2:
+        raise ValueError(f"an order needs two steps, got n_steps={n_steps}")
     evaluate = jax.jit(lambda x: objective(unravel(x)))
     gradient = jax.jit(jax.grad(objective))(u) if gradient is None else gradient
-    slope = np.asarray(ravel_pytree(gradient)[0])
+    if jax.tree.map(np.shape, gradient) != jax.tree.map(np.shape, u):
+        raise ValueError(
+            f"the gradient must be shaped like u, {jax.tree.map(np.shape, u)}, got "
+            f"{jax.tree.map(np.shape, gradient)}"
+        )
+    slope = np.asarray(ravel_pytree(gradient)[0], float)
     value = float(evaluate(flat))
 
+    # Moduli and ratios side by side: each array moves by the same share of itself.
+    leaves = [np.ravel(np.asarray(x, float)) for x in jax.tree.leaves(u)]
+    size = np.concatenate([np.full(x.size, np.linalg.norm(x) or 1.0) for x in leaves])
     random = np.random.default_rng(seed).normal(size=(directions, flat.size))
-    length = float(np.linalg.norm(flat)) or 1.0
-    rows = np.concatenate([slope[None], random])
+    rows = np.concatenate([(size * slope)[None], random])
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
-    rows = rows * (length / np.where(norms > 0.0, norms, 1.0))
+    rows = size * rows / np.where(norms > 0.0, norms, 1.0)
     rows = rows.astype(flat.dtype)
 
     steps = step * 0.5 ** np.arange(n_steps)
@@ -150,11 +177,15 @@ def check_gradient(
     linear = derivative[:, None] * steps
     remainder = np.abs(np.stack([plus - value - linear, minus - value + linear], axis=1))
     central = np.abs((plus - minus) / (2.0 * steps) - derivative[:, None])
-    size = max(abs(value), float(np.max(np.abs(derivative))))
-    noise = NOISE * float(np.finfo(flat.dtype).eps) * size
+    magnitude = max(abs(value), float(np.max(np.abs(derivative))))
+    noise = NOISE * float(np.finfo(flat.dtype).eps) * magnitude
     order = np.array([[_order(side, noise) for side in both] for both in remainder])
     quotients = (plus[:, -1] - value) / steps[-1], (value - minus[:, -1]) / steps[-1]
     weak, changes = _count_contacts(trajectory, unravel, flat, step * rows)
+    is_constant = not np.any(slope) and np.all(plus == value) and np.all(minus == value)
+    resolution = _resolution(remainder, steps, derivative, noise)
+    limit = np.maximum(8.0 * noise, np.max(remainder, axis=2) * (steps[-1] / steps[0]) ** NO_ORDER)
+    is_jump = np.any(remainder[:, :, -1] > limit)
     return GradientCheck(
         value=value,
         steps=steps,
@@ -165,8 +196,22 @@ def check_gradient(
         noise=noise,
         weak_contacts=weak,
         contact_changes=changes,
-        verdict=_verdict(order, derivative, quotients, noise / steps[-1], weak),
+        verdict=(
+            _not_finite(value, slope)
+            or ("CONSTANT: J does not change, and its gradient is zero" if is_constant else "")
+            or ("JUMP: the objective does not tend to J(u) here: no derivative" if is_jump else "")
+            or _verdict(order, resolution, quotients, noise / steps[-1], weak)
+        ),
     )
+
+
+def _scale(derivative: np.ndarray) -> np.ndarray:
+    return np.where(derivative == 0.0, 1.0, np.abs(derivative))
+
+
+def _resolution(remainder, steps, derivative, noise: float) -> np.ndarray:
+    errors = np.min(np.maximum(np.max(remainder, axis=1), noise) / steps, axis=1)
+    return np.maximum(errors / _scale(derivative), np.finfo(float).eps)
 
 
 def _order(remainder: np.ndarray, noise: float) -> float:
@@ -184,13 +229,30 @@ def _order(remainder: np.ndarray, noise: float) -> float:
     return float(np.median(np.log2(usable[:-1] / usable[1:])[-3:]))
 
 
-def _verdict(order, derivative, quotients, noise, weak) -> str:
-    if not np.all(np.isfinite(derivative)) or np.any(np.isnan(order)):
-        return "NOT FINITE: the gradient or the objective is NaN; see Trajectory.status"
+def _not_finite(value: float, slope: np.ndarray) -> str:
+    if not np.isfinite(value):
+        return "NOT FINITE: the objective is not finite at u; see Trajectory.status"
+    if not np.all(np.isfinite(slope)):
+        return "NOT FINITE: the objective is finite at u, its gradient is not"
+    return ""
+
+
+def _verdict(order, resolution, quotients, noise, weak) -> str:
+    if np.any(np.isnan(order)):
+        return "NOT FINITE: the objective is not finite near u; see Trajectory.status"
     is_second = order >= SECOND_ORDER
+    best, worst = float(np.min(resolution)), float(np.max(resolution))
+    if np.all(np.isinf(order)) and best > COARSEST:
+        return (
+            f"UNDECIDED: J does not change beyond its rounding, which hides errors of {best:.0e} "
+            "of the derivative; take a larger step, float64, or J without its constant part"
+        )
     if np.all(is_second):
         hint = "" if not weak else " (weak contact is present, but does not enter here)"
-        return f"RIGHT: second order on both sides along every direction{hint}"
+        return (
+            "RIGHT: second order on both sides along every direction, so that J' d is exact to "
+            f"{worst:.0e} or better{hint}"
+        )
     right, left = quotients
     is_kink = np.abs(right - left) > 1e-3 * np.maximum(np.abs(right), np.abs(left)) + 4.0 * noise
     wrong = ~is_second.any(axis=1)
@@ -202,12 +264,20 @@ def _verdict(order, derivative, quotients, noise, weak) -> str:
     if np.any(wrong):
         return (
             "KINK: the objective has different one-sided derivatives here, and along some "
-            "direction the gradient is neither of them; choose weak_contact=AlongDirection(...)"
+            f"direction the gradient is neither of them; {_where_the_kink_is(weak)}"
         )
     return (
         "ONE-SIDED: the objective has a kink here; the gradient is the exact derivative on one "
         "side of it"
     )
+
+
+def _where_the_kink_is(weak: int | None) -> str:
+    if weak is None:
+        return "give trajectory= to see whether a contact is weak"
+    if weak == 0:
+        return "no contact is weak, so the kink is in the cost, or a contact closer than the steps"
+    return "choose weak_contact=AlongDirection(...)"
 
 
 def _order_words(order: float) -> str:

@@ -53,7 +53,7 @@ def directional_derivative(
 
     Returns:
         A trajectory that holds the derivatives of time, displacement, velocity, gap and
-        contact_impulse; active, iterations and status are those of the motion.
+        contact_impulse; active, weak, iterations and status are those of the motion.
 
     Raises:
         ValueError: if shapes do not fit.
@@ -85,6 +85,7 @@ def directional_derivative(
     return replace(
         tangent,
         active=trajectory.active,
+        weak=trajectory.weak,
         iterations=trajectory.iterations,
         status=trajectory.status,
     )

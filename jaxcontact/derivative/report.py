@@ -26,6 +26,9 @@ from jaxcontact.simulate import StepShift, raise_if_failed, simulate, simulate_s
 from jaxcontact.stepper import Stepper
 from jaxcontact.trajectory import State, Trajectory
 
+#: A duality gap beyond rounding, also in float32 over many steps.
+MODES_DIFFER = 1e-3
+
 
 @dataclass(frozen=True)
 class DerivativeReport:
@@ -58,10 +61,12 @@ class DerivativeReport:
     and impulse / largest impulse; zero if and only if there is weak contact."""
 
     cone: np.ndarray
-    """(N p)_i of the open branch on the weak contacts, (W,) [1/N times the cost]."""
+    """(N p)_i of the open branch on the weak contacts, (W,) [1/N times the cost]; zero in the
+    predictor of `ContactStabilized`, which no load reaches."""
 
     polar: np.ndarray
-    """xi_i of the closed branch on the weak contacts, (W,) [1/m times the cost]."""
+    """xi_i of the closed branch beyond that of the open one on the weak contacts, (W,) [1/m times
+    the cost]."""
 
     @property
     def is_differentiable(self) -> bool:
@@ -75,6 +80,8 @@ class DerivativeReport:
 
     def __str__(self) -> str:
         """Return the certificate in words."""
+        if not np.isfinite(self.adjoint_residual + self.duality_gap):
+            return "NOT FINITE: the cost or its derivative is NaN; the motion itself is solved"
         lines = [
             f"motion:  KKT residual {self.forward_residual:.1e}, worst step "
             f"{self.worst_status.name.lower().replace('_', ' ')}",
@@ -86,7 +93,9 @@ class DerivativeReport:
         for (step, node), cone, polar in zip(self.weak, self.cone, self.polar, strict=True):
             signs = f"(N p) = {cone:.3e}, xi = {polar:.3e}: {_kind(cone, polar)}"
             lines.append(f"  step {step}, node {node}: {signs}")
-        if self.is_differentiable:
+        if self.duality_gap > MODES_DIFFER:
+            lines.append("WRONG: forward and reverse mode of the cost differ.")
+        elif self.is_differentiable:
             lines.append("The gradient is the derivative.")
         elif self.has_right_signs:
             lines.append("One-sided derivatives only; every kink is a valley, as at a minimum.")
@@ -155,8 +164,8 @@ def derivative_report(
         nearly_weak=_places(is_near, nodes),
         tolerance=tolerance,
         margin=float(np.min(np.where(weak, 0.0, margins), initial=np.inf)),
-        cone=in_cone[weak],
-        polar=-np.asarray(closed.gap)[weak],
+        cone=np.where(np.asarray(trajectory.active), in_cone, 0.0)[weak],
+        polar=np.asarray(opened.gap - closed.gap)[weak],
     )
 
 

@@ -28,7 +28,7 @@ from jaxcontact.schemes.block_matrix import from_symmetric
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.mass_redistribution import redistribute, tangential_projection
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.sparse import SymmetricMatrix
+from jaxcontact.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system import System
 
 
@@ -37,7 +37,7 @@ from jaxcontact.system import System
 class RedistributedOperators:
     """Operators of the scheme with massless contact nodes."""
 
-    mass: SymmetricMatrix
+    mass: ComponentwiseMatrix | SymmetricMatrix
     """M_r, singular: M_r N^T = 0, (n, n) [kg]."""
 
     problem: ContactProblem
