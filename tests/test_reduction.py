@@ -103,3 +103,8 @@ def test_reduce_refuses_an_impossible_number_of_modes(problem, modes):
 def test_reduce_refuses_a_reduced_system(problem):
     with pytest.raises(ValueError, match="reduced already"):
         jc.reduce(jc.reduce(problem.system, 5), 3)
+
+
+def test_reduced_system_refuses_a_sparse_factorisation(problem):
+    with pytest.raises(ValueError, match=r"reduced model are dense; use linear_solver=jc\.Dense"):
+        jc.prepare(jc.reduce(problem.system, 5), 1e-4, linear_solver=jc.NestedDissection())

@@ -134,8 +134,11 @@ class NestedDissection:
                 uses distances in the graph of the matrix.
 
         Raises:
-            ValueError: if the pattern of `matrix` or `normals` or the coordinates are traced.
+            ValueError: if the matrix is dense, or its pattern, `normals.unknowns` or the
+                coordinates are traced.
         """
+        if matrix.columns is None:
+            raise ValueError("the matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         columns = unknown_columns(matrix.columns, matrix.values.shape[1])
         plan = plan_for(columns, normals.unknowns, coordinates, self.leaf_size)
         blocks, inverse, is_positive = factorize_fronts(matrix.values, plan.stages)
