@@ -16,7 +16,7 @@ from jaxcontact.contact import (
     Strong,
     with_contact,
 )
-from jaxcontact.cost import TrackingCost
+from jaxcontact.cost import TrackingCost, contact_force, contact_force_error, contact_time
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
@@ -35,6 +35,7 @@ from jaxcontact.obstacle import Ball, HalfSpace, SignedDistance
 from jaxcontact.optimize import (
     LBFGS,
     Actuator,
+    Descent,
     History,
     Homotopy,
     NewtonCG,
@@ -45,6 +46,7 @@ from jaxcontact.optimize import (
     WeakWolfe,
     actuator,
     boundary_actuator,
+    descend,
     load_result,
     optimize,
     stationarity,
@@ -79,6 +81,7 @@ __all__ = [
     "CriticalCone",
     "Dense",
     "DerivativeReport",
+    "Descent",
     "Energy",
     "GradientCheck",
     "HalfSpace",
@@ -114,8 +117,12 @@ __all__ = [
     "actuator",
     "boundary_actuator",
     "check_gradient",
+    "contact_force",
+    "contact_force_error",
     "contact_pressure",
+    "contact_time",
     "derivative_report",
+    "descend",
     "directional_derivative",
     "discretize",
     "energy",

@@ -44,7 +44,7 @@ class Grazing:
         return {"system": self.stepper.system, "dt": DT}
 
 
-def grazing(target=0.15, **options):
+def grazing(target=0.15, dtype=jnp.float64, **options):
     """The problem; targets beyond the wall put the minimiser on the kink."""
     scene = jc.Scene(
         mesh=jc.meshes.interval(1.0, h=1.0),
@@ -52,7 +52,7 @@ def grazing(target=0.15, **options):
         clamped=("left",),
         contact={"right": jc.HalfSpace(point=np.array([1.0 + WALL]), normal=np.array([-1.0]))},
     )
-    return Grazing(jc.prepare(jc.discretize(scene), DT, **options), target)
+    return Grazing(jc.prepare(jc.discretize(scene, dtype=dtype), DT, **options), target)
 
 
 def influence(problem):

@@ -376,7 +376,8 @@ def test_discretize_under_jit_equals_discretize():
     def matrices(material, point):
         obstacle = jc.HalfSpace(point, jnp.array([0.0, 1.0]))
         system = jc.discretize(jc.Scene(mesh, material, contact={"bottom": obstacle}))
-        return system.stiffness.values, system.viscosity.values, system.mass.scalar.values, system.gap
+        mass = system.mass.scalar.values
+        return system.stiffness.values, system.viscosity.values, mass, system.gap
 
     point = jnp.array([0.0, -1.0])
     for traced, eager in zip(

@@ -5,7 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from kinked import START, Grazing, grazing, minimizer
+from kinked import DT, START, WALL, Grazing, grazing, influence, minimizer
 
 import jaxcontact as jc
 from jaxcontact.optimize import problem as evaluation
@@ -88,6 +88,24 @@ def test_homotopy_within_bounds_ends_at_the_bounded_minimiser():
     np.testing.assert_allclose(final.gap[-1], 0.0, atol=1e-6)
     np.testing.assert_allclose(result.control[0, 1, 0], upper[0, 1, 0])
     assert result.stationarity.residual < 1e-6 * result.history.gradient_norm[0]
+
+
+def test_homotopy_over_an_actuator_finds_the_best_admissible_push():
+    # One constant push for both steps: it grazes the wall with u = psi / (L_11 (c_1 + c_2)).
+    problem = grazing()
+    system = problem.stepper.system
+    push = jc.actuator(system, 2, nodes=[1], direction=[1.0], intervals=1)
+    result = jc.optimize(
+        problem.objective,
+        push.zeros(),
+        method=jc.Homotopy(levels=LEVELS),
+        controls=push,
+        system=system,
+        dt=DT,
+    )
+    expected = 3.0 * WALL / np.sum(influence(problem))
+    np.testing.assert_allclose(result.parameters, [[expected]], rtol=ACCURACY)
+    assert result.stationarity.is_strong
 
 
 def test_homotopy_needs_an_objective_that_holds_the_stepper():

@@ -162,7 +162,7 @@ def test_bar_satisfies_signorini_at_the_wall(bar):
     assert force.min() >= 0
     np.testing.assert_allclose(gap * force, 0, atol=1e-9)
     is_pressed = force > 0
-    stress = np.asarray(bar.young * bar.strain(0.0, t))
+    stress = np.asarray(bar.stress(0.0, t))
     np.testing.assert_allclose(force[is_pressed], -stress[is_pressed], rtol=1e-9)
 
 

@@ -101,18 +101,18 @@ def test_trapezoidal_does_not_survive_ten_impacts():
     assert ledger.total[-1] > 5.0 * ledger.total[0]
 
 
+@pytest.mark.parametrize("n", [100, pytest.param(800, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bar", [bars.clamped_bar(3.0), bars.falling_bar()], ids=["P1", "P3"])
-def test_contact_implicit_never_gains_energy_in_a_step(bar):
-    # 40 cells: the rounding of y.Ay at displacements of 5 m grows with their square.
-    dt = bars.time_step(bar, 40, 0.7)
-    stepper = jc.prepare(bars.discretize(bar, 40), dt)
+def test_contact_implicit_never_gains_energy_in_a_step(bar, n):
+    dt = bars.time_step(bar, n, 0.7)
+    stepper = jc.prepare(bars.discretize(bar, n), dt)
     _, stepper, initial = bars.place(bar, stepper, 5.0)
     trajectory = jc.simulate(stepper, steps=math.ceil(bar.duration / dt), initial=initial)
     assert jnp.any(trajectory.contact_impulse > 0.0)
     ledger = jc.energy(stepper, trajectory)
-    gain = jnp.diff(ledger.total) - ledger.work
     energy = float(bar.exact.energy())
-    assert jnp.max(gain) <= 1e-12 * energy
+    # Asked are 1e-12; the rounding of one step is below 1e-14.
+    assert jnp.max(ledger.change - ledger.work) <= 1e-13 * energy
     assert jnp.min(ledger.impact_loss) >= -1e-14 * energy
 
 
@@ -121,7 +121,7 @@ def test_contact_implicit_dissipates_in_each_of_1e5_steps():
     # 1e5 steps at nu = 1 on 20 cells are 1700 impacts.
     ledger = fly(jc.ContactImplicit(), 20, 1.0, periods=1e5 / 60)[2]
     assert ledger.work.shape == (100_000,)
-    assert jnp.max(jnp.diff(ledger.total)) <= 1e-12 * ledger.total[0]
+    assert jnp.max(ledger.change) <= 1e-14 * ledger.total[0]
     assert ledger.total[-1] < ledger.total[0]
 
 
@@ -174,6 +174,8 @@ def test_scheme_solves_steps_far_from_those_of_the_paper(scheme, factor):
     size = jnp.max(ledger.total) + jnp.max(jnp.abs(ledger.work))
     assert jnp.max(jnp.abs(ledger.residual)) < 1e-9 * size
     assert jnp.any(trajectory.contact_impulse > 0.0) == (factor > 1.0)
+    if is_dissipative(scheme):
+        assert jnp.max(ledger.change - ledger.work) < 1e-12 * size
 
 
 def test_nearly_incompressible_material_locks_linear_triangles():

@@ -138,7 +138,7 @@ class NestedDissection:
                 coordinates are traced.
         """
         if matrix.columns is None:
-            raise ValueError("the matrices of a reduced model are dense; use linear_solver=jc.Dense()")
+            raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         columns = unknown_columns(matrix.columns, matrix.values.shape[1])
         plan = plan_for(columns, normals.unknowns, coordinates, self.leaf_size)
         blocks, inverse, is_positive = factorize_fronts(matrix.values, plan.stages)

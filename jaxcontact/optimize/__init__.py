@@ -2,6 +2,7 @@
 
 from jaxcontact.optimize.certificate import Stationarity
 from jaxcontact.optimize.controls import Actuator, actuator, boundary_actuator
+from jaxcontact.optimize.descend import Descent, descend
 from jaxcontact.optimize.driver import optimize
 from jaxcontact.optimize.homotopy import Homotopy
 from jaxcontact.optimize.lbfgs import LBFGS
@@ -15,6 +16,7 @@ from jaxcontact.optimize.steepest_descent import SteepestDescent
 __all__ = [
     "LBFGS",
     "Actuator",
+    "Descent",
     "History",
     "Homotopy",
     "NewtonCG",
@@ -25,6 +27,7 @@ __all__ = [
     "WeakWolfe",
     "actuator",
     "boundary_actuator",
+    "descend",
     "load_result",
     "optimize",
     "stationarity",

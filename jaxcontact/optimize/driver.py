@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.optimize.inner_products import L2, InnerProduct, lumped_l2
@@ -85,6 +86,9 @@ def optimize(
         ImportError: if a progress bar is asked for and the extra `progress` is not installed.
     """
     method = LBFGS() if method is None else method
+    check_method(method)
+    if iterations < 0:
+        raise ValueError(f"iterations must not be negative, got {iterations}")
     start = jnp.asarray(u0.parameters if isinstance(u0, Result) else u0)
     start = jnp.asarray(start, start.dtype)  # a weak type would compile everything twice
     problem = state_problem(objective, start, system, dt, bounds, controls, inner_product)
@@ -92,6 +96,7 @@ def optimize(
     if isinstance(u0, Result):
         unknown = Point(start, 0.0, start, start)
         state = rebuild_state(method.init(problem, unknown), u0, name)
+        _check_same_problem(problem, state.point)
         recorder = Recorder(problem, u0.history)
         best = min(unknown._replace(value=u0.value), state.point, key=_value)
     else:
@@ -122,7 +127,8 @@ def optimize(
             state = new_state
             _report(recorder, problem, state.point, bar, callback)
         if recorder.is_below(tolerance):
-            status = f"converged: the gradient norm is at most {tolerance:g} of the first one"
+            share = f"at most {tolerance:g} of the first one" if tolerance else "zero"
+            status = f"converged: the gradient norm is {share}"
     except KeyboardInterrupt:
         status = f"interrupted after {recorder.iterations} iterations; this is the best one"
     finally:
@@ -138,6 +144,18 @@ def optimize(
         method=name,
         state=state,
     )
+
+
+def _check_same_problem(problem: Problem, point: Point) -> None:
+    """Raise a ValueError if the objective has another value at a point than was saved."""
+    value = problem.evaluate(point.parameters).value
+    # On another machine the value differs by rounding, which contact amplifies.
+    if not abs(value - point.value) <= 1e-6 * abs(point.value) + np.finfo(float).tiny:
+        raise ValueError(
+            f"the saved result has the value {point.value:.9g} where this objective has "
+            f"{value:.9g}: it belongs to another problem. To start from it, hand over "
+            "result.parameters"
+        )
 
 
 def _certificate(problem: Problem, parameters: Array) -> Stationarity | None:
@@ -159,8 +177,8 @@ def state_problem(
     inner_product: InnerProduct | None,
 ) -> Problem:
     """Return the problem that the arguments of `optimize` state."""
-    product = _choose_product(inner_product, controls, system, dt, is_bounded=bounds is not None)
-    return Problem(objective, product, controls=controls, bounds=_check_bounds(bounds, start))
+    product = choose_product(inner_product, controls, system, dt, is_bounded=bounds is not None)
+    return Problem(objective, product, controls=controls, bounds=make_bounds(bounds, start))
 
 
 def _value(point: Point) -> float:
@@ -211,9 +229,17 @@ def _report(recorder: Recorder, problem: Problem, point: Point, bar: Any, callba
         callback(recorder.iterations, problem.controls(point.parameters), value, norm)
 
 
-def _choose_product(
+def check_method(method: Any) -> None:
+    """Raise a ValueError if a method is a class or a name instead of an object."""
+    if isinstance(method, type | str) or not hasattr(method, "step"):
+        name = method.__name__ if isinstance(method, type) else "LBFGS"
+        raise ValueError(f"method must be an object, such as jc.{name}(), got {method!r}")
+
+
+def choose_product(
     product: InnerProduct | None, controls: Any, system: Any, dt: Any, *, is_bounded: bool
 ) -> InnerProduct:
+    """Return the inner product that the arguments of `optimize` name."""
     if product is not None:
         return product
     if system is None or dt is None:
@@ -225,12 +251,22 @@ def _choose_product(
     return lumped_l2(system, dt) if is_bounded else L2(system, dt)
 
 
-def _check_bounds(bounds: tuple[Any, Any] | None, start: Array) -> tuple[Array, Array] | None:
+def make_bounds(bounds: tuple[Any, Any] | None, start: Array) -> tuple[Array, Array] | None:
+    """Return both bounds in the shape of the start."""
     if bounds is None:
         return None
+    if len(bounds) != 2:
+        raise ValueError("bounds must be a pair (lower, upper) of numbers or arrays")
+    for bound in bounds:
+        shape = np.shape(bound)
+        fits = all(n in (1, m) for n, m in zip(shape[::-1], start.shape[::-1], strict=False))
+        if len(shape) > start.ndim or not fits:
+            raise ValueError(
+                f"a bound of shape {shape} does not fit what is optimised, {start.shape}"
+            )
+    if not any(isinstance(bound, Tracer) for bound in bounds):
+        n_crossed = int(np.sum(~(np.asarray(bounds[0]) <= np.asarray(bounds[1]))))
+        if n_crossed:
+            raise ValueError(f"{n_crossed} lower bounds are above their upper bounds or NaN")
     lower, upper = (jnp.broadcast_to(jnp.asarray(b, start.dtype), start.shape) for b in bounds)
-    if not bool(jnp.all(lower <= upper)):
-        raise ValueError(
-            f"{int(jnp.sum(~(lower <= upper)))} lower bounds are above their upper bounds or NaN"
-        )
     return lower, upper

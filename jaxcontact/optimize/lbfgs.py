@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jax import Array
 
 from jaxcontact.optimize.bounds import free_variables, mask, move
 from jaxcontact.optimize.line_search import Trial, WeakWolfe
-from jaxcontact.optimize.problem import Point, Problem
+from jaxcontact.optimize.problem import Point, Problem, select
 
 
 class LBFGSState(NamedTuple):
@@ -35,11 +35,11 @@ class LBFGSState(NamedTuple):
     changes: Array
     """y_i, differences of the derivatives, (m, ...)."""
 
-    scale: float
-    """gamma of the first matrix."""
+    scale: Any
+    """gamma of the first matrix, a number, traced a scalar."""
 
-    count: int
-    """Pairs in the memory."""
+    count: Any
+    """Pairs in the memory, a number, traced a scalar."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,57 @@ class LBFGS:
             curvature / size,
             min(state.count + 1, self.memory),
         )
+
+    def traced_step(self, problem: Any, state: LBFGSState) -> tuple[LBFGSState, Array]:
+        """Return the next state, and whether there is one; see `descend`."""
+
+        def is_searching(carry):
+            state, is_found, attempts = carry
+            return ~is_found & ((attempts == 0) | ((attempts == 1) & (state.count > 0)))
+
+        def attempt(carry):
+            state, _, attempts = carry
+            tried = select(attempts == 0, state, self._forget_traced(state))
+            new_state, is_found = self._try_traced(problem, tried)
+            return select(is_found, new_state, state), is_found, attempts + 1
+
+        carry = state, jnp.bool_(False), jnp.int32(0)
+        state, is_found, _ = jax.lax.while_loop(is_searching, attempt, carry)
+        return state, is_found
+
+    def _forget_traced(self, state: LBFGSState) -> LBFGSState:
+        nothing = jnp.zeros_like(state.steps)
+        scale = jnp.full_like(state.scale, self.first_step)
+        return LBFGSState(state.point, nothing, nothing, scale, 0 * state.count)
+
+    def _try_traced(self, problem: Any, state: LBFGSState) -> tuple[LBFGSState, Array]:
+        point = state.point
+        free = free_variables(problem.bounds, point.parameters, point.derivative)
+        direction, slope = _direction(
+            problem.product, point.derivative, state.steps, state.changes, state.scale, free
+        )
+
+        def along(t: Array) -> Trial:
+            target, tangent = move(problem.bounds, point.parameters, direction, t)
+            trial = problem.evaluate(target)
+            return Trial(trial.value, jnp.vdot(trial.derivative, tangent), trial)
+
+        start = Trial(point.value, slope, point)
+        found, is_found = self.line_search.traced_search(along, start, slope)
+        new = found.point
+        s, y = new.parameters - point.parameters, new.derivative - point.derivative
+        curvature, size = jnp.vdot(s, y), jnp.vdot(y, new.gradient - point.gradient)
+        is_pair = (curvature > 0.0) & (size > 0.0)
+        remembered = LBFGSState(
+            new,
+            _append(state.steps, s),
+            _append(state.changes, y),
+            curvature / jnp.where(is_pair, size, 1.0),
+            jnp.minimum(state.count + 1, self.memory),
+        )
+        kept = state._replace(point=new)
+        is_descent = jnp.isfinite(slope) & (slope < 0.0)
+        return select(is_pair, remembered, kept), is_found & is_descent
 
 
 @jax.jit

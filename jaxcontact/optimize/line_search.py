@@ -13,15 +13,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxcontact.optimize.problem import select
+
 
 class Trial(NamedTuple):
     """A point on the search line."""
 
-    value: float
-    """f(t); infinite where f is not finite."""
+    value: Any
+    """f(t), a number, traced a scalar; infinite where f is not finite."""
 
-    slope: float
-    """f'(t), or one of the one-sided derivatives."""
+    slope: Any
+    """f'(t), a number, traced a scalar; or one of the one-sided derivatives."""
 
     point: Any
     """Whatever the caller needs of the point."""
@@ -70,3 +76,37 @@ class WeakWolfe:
             if step in (lower, upper):
                 break
         return found
+
+    def traced_search(
+        self, along: Callable[[Array], Trial], start: Trial, slope: Array
+    ) -> tuple[Trial, Array]:
+        """Search as `search` does from t = 1, in `lax.while_loop`.
+
+        Args:
+            along: evaluates f at t > 0, traceable.
+            start: f at t = 0.
+            slope: f'(0) < 0.
+
+        Returns:
+            The trial, and whether it is one with the first condition; else the start.
+        """
+
+        def is_searching(carry):
+            *_, is_done, trials = carry
+            return ~is_done & (trials < self.max_trials)
+
+        def attempt(carry):
+            step, lower, upper, found, is_found, _, trials = carry
+            trial = along(step)
+            is_lower = trial.value < start.value + self.decrease * step * slope
+            found = select(is_lower, trial, found)
+            lower, upper = jnp.where(is_lower, step, lower), jnp.where(is_lower, upper, step)
+            following = jnp.where(jnp.isinf(upper), 2.0 * lower, 0.5 * (lower + upper))
+            is_done = is_lower & (trial.slope > self.curvature * slope)
+            is_done = is_done | (following == lower) | (following == upper)
+            return following, lower, upper, found, is_found | is_lower, is_done, trials + 1
+
+        one, no = jnp.ones_like(start.value), jnp.bool_(False)
+        carry = one, 0.0 * one, jnp.inf * one, start, no, no, jnp.int32(0)
+        _, _, _, found, is_found, _, _ = jax.lax.while_loop(is_searching, attempt, carry)
+        return found, is_found

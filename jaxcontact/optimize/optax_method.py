@@ -8,7 +8,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import optax
+from jax import Array
 
 from jaxcontact.optimize.problem import Point, Problem
 
@@ -46,6 +48,12 @@ class Optax:
         if not math.isfinite(trial.value):
             return state, "the objective is not finite after an update; try a smaller learning rate"
         return OptaxState(trial, transformation), None
+
+    def traced_step(self, problem: Any, state: OptaxState) -> tuple[OptaxState, Array]:
+        """Return the next state, and whether it is finite; see `descend`."""
+        target, transformation = _update(self.transformation.update, *state)
+        trial = problem.evaluate(problem.project(target))
+        return OptaxState(trial, transformation), jnp.isfinite(trial.value)
 
 
 @partial(jax.jit, static_argnums=0)

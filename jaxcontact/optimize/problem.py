@@ -32,14 +32,19 @@ class Point(NamedTuple):
     parameters: Array
     """The point p."""
 
-    value: float
-    """J(E p); infinite where the objective is not finite."""
+    value: Any
+    """J(E p), a number, traced a scalar; infinite where the objective is not finite."""
 
     derivative: Array
     """dJ/dp, entry by entry."""
 
     gradient: Array
     """Riesz representative of the derivative."""
+
+
+def select(condition: Array, first: Any, second: Any) -> Any:
+    """Return one of two pytrees of arrays, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
 
 
 def identity(parameters: Array) -> Array:
@@ -86,7 +91,7 @@ class Problem:
         self.evaluations = 0
         self.hessian_products = 0
         is_compiled = all(_is_pytree(part) for part in (self.objective, self.controls, product))
-        self._evaluate = _evaluate_compiled if is_compiled else _evaluate
+        self._evaluate = _evaluate_compiled if is_compiled else value_and_gradient
         self._hessian_product = _hessian_product_compiled if is_compiled else _hessian_product
 
     def evaluate(self, parameters: Array) -> Point:
@@ -126,7 +131,10 @@ class Problem:
         return math.sqrt(self.dot(step, step))
 
 
-def _evaluate(objective, controls, product, parameters):
+def value_and_gradient(
+    objective: Any, controls: Any, product: InnerProduct, parameters: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return value, derivative, gradient, and whether all of them are finite; traceable."""
     value, derivative = jax.value_and_grad(lambda p: objective(controls(p)))(parameters)
     gradient = product.riesz(derivative)
     is_finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
@@ -149,5 +157,5 @@ def _riesz(product, covector):
 
 
 # Module-level, so that a second optimisation of the same problem compiles nothing.
-_evaluate_compiled = jax.jit(_evaluate)
+_evaluate_compiled = jax.jit(value_and_gradient)
 _hessian_product_compiled = jax.jit(_hessian_product)

@@ -89,8 +89,16 @@ class Result:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a result that `Result.save` wrote; hand it to `optimize` as start to go on."""
+    """Read a result that `Result.save` wrote; hand it to `optimize` as start to go on.
+
+    Raises:
+        ValueError: if the file holds something else.
+    """
     with np.load(path, allow_pickle=False) as data:
+        needed = {"control", "parameters", "value", "status", "method"}
+        missing = (needed | {f"history_{column.name}" for column in fields(History)}) - set(data)
+        if missing:
+            raise ValueError(f"{path} holds no saved result; {sorted(missing)} are missing")
         names = sorted(name for name in data.files if name.startswith("state_"))
         return Result(
             control=jnp.asarray(data["control"]),

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import Array
 
-from jaxcontact.optimize.problem import ROUNDING, Point, Problem
+from jaxcontact.optimize.problem import ROUNDING, Point, Problem, select
 
 
 class SteepestDescentState(NamedTuple):
@@ -71,3 +73,33 @@ class SteepestDescent:
                 return SteepestDescentState(trial, next_omega), None
             omega = next_omega
         return state, "no step along the gradient reduces the value; this is a kink or a minimum"
+
+    def traced_step(
+        self, problem: Any, state: SteepestDescentState
+    ) -> tuple[SteepestDescentState, Array]:
+        """Return the next state, and whether there is one; see `descend`."""
+        point, first_omega = state
+
+        def is_searching(carry):
+            _, _, is_found, is_hopeless, trials = carry
+            return ~is_found & ~is_hopeless & (trials < self.max_trials)
+
+        def attempt(carry):
+            _, omega, _, _, trials = carry
+            target = problem.project(point.parameters - point.gradient / omega)
+            step = target - point.parameters
+            slope = jnp.vdot(point.derivative, step)
+            predicted = -slope - 0.5 * omega * problem.dot(step, step)
+            is_hopeless = ~(predicted > ROUNDING * jnp.abs(point.value))
+            trial = problem.evaluate(target)
+            ratio = (point.value - trial.value) / jnp.where(is_hopeless, 1.0, predicted)
+            factor = jnp.where(jnp.isfinite(ratio), 2.0 - ratio, jnp.inf)
+            omega = omega * jnp.clip(factor, self.reduction, self.increase)
+            is_found = (ratio >= self.acceptance) & (trial.value < point.value) & ~is_hopeless
+            return trial, omega, is_found, is_hopeless, trials + 1
+
+        no, none = jnp.bool_(False), jnp.int32(0)
+        trial, omega, is_found, _, _ = jax.lax.while_loop(
+            is_searching, attempt, (point, first_omega, no, no, none)
+        )
+        return SteepestDescentState(select(is_found, trial, point), omega), is_found

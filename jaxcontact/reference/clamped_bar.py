@@ -64,9 +64,13 @@ class ClampedBar:
         return speed / 2 * (_slope(left) - _slope(right))
 
     def strain(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the strain u_x, shape of x and t [-]; the stress is young * strain."""
+        """Return the strain u_x, shape of x and t [-]."""
         left, right = self._characteristics(x, t)
         return -self.amplitude / (2 * self.length) * (_slope(left) + _slope(right))
+
+    def stress(self, x: ArrayLike, t: ArrayLike) -> Array:
+        """Return the stress E u_x, shape of x and t [Pa]; minus the contact pressure at x = 0."""
+        return self.young * self.strain(x, t)
 
     def contact_force(self, t: ArrayLike) -> Array:
         """Return the contact pressure p = E a/L during contact, else 0, shape of t [Pa]."""

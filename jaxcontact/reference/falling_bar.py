@@ -114,7 +114,7 @@ class FallingBar:
         return sign * jnp.where(t < self.contact_interval()[0], -g * t, later)
 
     def strain(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the strain u_x, shape of x and t [-]; the stress is young * strain."""
+        """Return the strain u_x, shape of x and t [-]."""
         x, t = jnp.broadcast_arrays(x, t)
         t, sign = self._fold(t)
         L, c, g, v0 = self.length, self.wave_speed(), self.gravity, self.rebound_velocity()
@@ -135,6 +135,10 @@ class FallingBar:
         s, _, _ = self._flight_wave(t)
         flight = v0 * s - g * s**2 / 2 - 2 * g * L**2 / (3 * c**2)
         return sign**2 * (fall + jnp.where(s < 0, contact, flight))
+
+    def stress(self, x: ArrayLike, t: ArrayLike) -> Array:
+        """Return the stress E u_x, shape of x and t [Pa]; minus the contact pressure at x = 0."""
+        return self.young * self.strain(x, t)
 
     def contact_force(self, t: ArrayLike) -> Array:
         """Return the contact pressure on [start, end), else 0, shape of t [Pa]."""

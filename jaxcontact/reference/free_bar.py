@@ -70,9 +70,13 @@ class FreeBar:
         return self.impact_speed * jnp.where(x < place, 0, jnp.where(way < self.length, -1, 1))
 
     def strain(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the strain u_x, shape of x and t [-]; the stress is young * strain."""
+        """Return the strain u_x, shape of x and t [-]."""
         x, t = jnp.broadcast_arrays(x, t)
         return jnp.where(x < self._shock(t)[1], -self.impact_speed / self.wave_speed(), 0)
+
+    def stress(self, x: ArrayLike, t: ArrayLike) -> Array:
+        """Return the stress E u_x, shape of x and t [Pa]; minus the contact pressure at x = 0."""
+        return self.young * self.strain(x, t)
 
     def contact_force(self, t: ArrayLike) -> Array:
         """Return the contact pressure v0 sqrt(E rho) on [start, end), else 0, shape of t [Pa]."""
