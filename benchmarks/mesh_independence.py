@@ -25,8 +25,8 @@ DURATION = 0.0075
 DECREASE = 0.999
 METHODS = {
     "homotopy": (jc.Homotopy(levels=6), 20),
-    "L-BFGS": (LBFGS(), 300),
-    "steepest descent": (jc.SteepestDescent(), 1000),
+    "L-BFGS": (LBFGS(), 150),
+    "steepest descent": (jc.SteepestDescent(), 300),
 }
 QUICK_METHODS = {"homotopy": (jc.Homotopy(levels=2), 20), "L-BFGS": (LBFGS(), 5)}
 
