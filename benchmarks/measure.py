@@ -8,6 +8,7 @@ import os
 import platform
 import statistics
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -88,6 +89,16 @@ def memory(program: Any) -> dict[str, int]:
         "output_bytes": int(analysis.output_size_in_bytes),
         "temporary_bytes": int(analysis.temp_size_in_bytes),
     }
+
+
+def peak_memory() -> float | None:
+    """Return the largest memory that this process has had, [MB]; None where it is not known."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1e-6 if sys.platform == "darwin" else 1.024e-3
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def machine() -> dict[str, Any]:

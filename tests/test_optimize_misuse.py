@@ -21,7 +21,7 @@ def problem():
     return objective, start, space
 
 
-@pytest.mark.parametrize("method", [jc.LBFGS, jc.Homotopy, "lbfgs", optax.adam(0.1)], ids=str)
+@pytest.mark.parametrize("method", [jc.LBFGS, jc.Homotopy, "lbfgs", optax.adam(0.1)], ids=range(4))
 def test_optimize_refuses_what_is_no_method(problem, method):
     objective, start, space = problem
     with pytest.raises(ValueError, match=r"an object, such as jc\.(LBFGS|Homotopy)\(\)"):
