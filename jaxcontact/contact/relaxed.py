@@ -88,8 +88,9 @@ class RelaxedContact:
             size = jnp.abs(compliance) @ p + jnp.abs(offset) + g
             return jnp.finfo(x.dtype).eps * size
 
-        def merit(error: Array) -> Array:
-            return jnp.linalg.norm(error / scale)
+        def merit(x: Array, error: Array) -> Array:
+            # Rounding of a pair far from contact must not hide the descent of the others.
+            return jnp.linalg.norm(jnp.maximum(jnp.abs(error) - noise(x), 0.0) / scale)
 
         def is_unfinished(carry):
             _, error, goal, best, steps, patience = carry
@@ -101,10 +102,12 @@ class RelaxedContact:
             p, g, root = _pair(x, diagonal, kappa)
             everywhere = jnp.ones(x.shape, bool)
             direction = solve_on_set(compliance, everywhere, g / p, -error) * (root / p)
+            old_size = merit(x, error)
 
             def is_too_long(trial):
                 t, trial_error = trial
-                is_worse = ~(merit(trial_error) <= (1.0 - 0.1 * t) * merit(error))
+                size = merit(x + t * direction, trial_error)
+                is_worse = ~(size <= (1.0 - 0.1 * t) * old_size)
                 return is_worse & (t > 0.5**MAX_HALVINGS)
 
             def shorten(trial):
@@ -114,7 +117,7 @@ class RelaxedContact:
             full = (jnp.ones((), x.dtype), residual(x + direction))
             t, new_error = jax.lax.while_loop(is_too_long, shorten, full)
             x = x + t * direction
-            size = merit(new_error)
+            size = merit(x, new_error)
             # Rounding ends the descent: a few steps without progress are enough.
             patience = jnp.where(size < 0.95 * best, PATIENCE, patience - 1)
             return x, new_error, noise(x), jnp.minimum(best, size), steps + 1, patience
@@ -122,7 +125,7 @@ class RelaxedContact:
         multiplier = solve_on_set(compliance, closed, None, jnp.where(closed, -offset, 0.0))
         x = diagonal * multiplier - separation(compliance, offset, multiplier)
         error = residual(x)
-        start = (x, error, noise(x), merit(error), jnp.int32(0), jnp.int32(PATIENCE))
+        start = (x, error, noise(x), merit(x, error), jnp.int32(0), jnp.int32(PATIENCE))
         x, error, goal, _, steps, _ = jax.lax.while_loop(is_unfinished, advance, start)
         multiplier, _, _ = _pair(x, diagonal, kappa)
         goal = 64.0 * goal + complementarity.tolerance(offset, resolution)
