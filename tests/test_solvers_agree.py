@@ -49,11 +49,17 @@ def slivers(dt):
     return thrown(scene, dt, push=1e6)
 
 
-CASES = [(paper, dt) for dt in (1e-7, 5e-5, 1e-3, 1e-2)] + [(slivers, dt) for dt in (1e-7, 1e-5)]
-NAMES = [f"{scene.__name__}-{dt:g}" for scene, dt in CASES]
-
-
-@pytest.mark.parametrize(("scene", "dt"), CASES, ids=NAMES)
+@pytest.mark.parametrize(
+    ("scene", "dt"),
+    [
+        (paper, 1e-7),
+        pytest.param(paper, 5e-5, marks=pytest.mark.slow),
+        pytest.param(paper, 1e-3, marks=pytest.mark.slow),
+        (paper, 1e-2),
+        pytest.param(slivers, 1e-7, marks=pytest.mark.slow),
+        (slivers, 1e-5),
+    ],
+)
 def test_nested_dissection_moves_as_the_dense_inverse(scene, dt):
     system, control, initial = scene(dt)
     scale = jnp.max(jnp.abs(initial.velocity)) * dt
