@@ -91,6 +91,7 @@ def shear_mode_error(cells):
     return float(np.abs(np.asarray(final.displacement) - exact).max())
 
 
+@pytest.mark.slow
 def test_shear_vibration_in_2d_is_of_second_order_in_mesh_and_step_together():
     # Right triangles of one direction are poor at shear: 1.8 from 12 to 24 cells, rising to 2.
     errors = [shear_mode_error(cells) for cells in (8, 16, 32)]

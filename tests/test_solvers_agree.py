@@ -52,7 +52,7 @@ def slivers(dt):
 @pytest.mark.parametrize(
     ("scene", "dt"),
     [
-        (paper, 1e-7),
+        pytest.param(paper, 1e-7, marks=pytest.mark.slow),
         pytest.param(paper, 5e-5, marks=pytest.mark.slow),
         pytest.param(paper, 1e-3, marks=pytest.mark.slow),
         (paper, 1e-2),
