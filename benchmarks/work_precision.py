@@ -223,6 +223,8 @@ def chart(rows: list[dict]):
             points = [(r[key], r[quantity]) for r in mine if np.isfinite(r[quantity])]
             axis.step(*np.array(pareto(points)).T, "k-", lw=0.8, where="post")
             axis.set(xscale="log", yscale="log", title=f"{problem}: {quantity}")
+            # Gradients of Trapezoidal grow to 1e100; a point above the frame is useless.
+            axis.set_ylim(top=min(axis.get_ylim()[1], 30.0))
             axis.grid(alpha=0.3)
         line[0].set_ylabel("relative error")
     for axis in axes[-1]:
