@@ -27,8 +27,7 @@ from jax import Array
 
 #: A set that differs in more than C / 8 pairs is factorised anew: an exchange reads and writes the
 #: matrix once, a factorisation costs about as much as C / 8 of them.
-MOST_EXCHANGES = 8
-
+PAIRS_PER_EXCHANGE = 8
 
 #: Number of exchanges that marks a transform as worn: the next one is made anew.
 WORN = 2**30
@@ -55,7 +54,7 @@ def unpivoted(compliance: Array) -> PivotedCompliance:
 def pivot(pivoted: PivotedCompliance, compliance: Array, pairs: Array) -> PivotedCompliance:
     """Solve the compliance W, (C, C), for another set of pairs, (C,) bool."""
     n_changes = jnp.sum(pivoted.pairs != pairs)
-    is_far = MOST_EXCHANGES * (n_changes - 1) > pairs.shape[0]
+    is_far = PAIRS_PER_EXCHANGE * (n_changes - 1) > pairs.shape[0]
 
     # A loop of at most one turn: vmap evaluates both branches of a cond, but it can skip a loop.
     def make_anew(carry: tuple[PivotedCompliance, Array]) -> tuple[PivotedCompliance, Array]:
