@@ -107,9 +107,10 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
         new = measure_case(rings, steps, methods, options.dtype)
         measure.print_table(new)
         rows += new
+        # After every problem, so that an interrupted run leaves what it has.
+        measure.save("mesh_independence", rows, options.out, dtype=str(options.dtype))
         if not options.quick:
             jax.clear_caches()  # programs of another shape are of no use to the next problem
-    measure.save("mesh_independence", rows, options.out, dtype=str(options.dtype))
     draw(rows, options.out)
     return rows
 
