@@ -52,8 +52,9 @@ def check_every_parameter(dimension, scheme, obstacle):
         # Large steps may cross a kink, small ones drown in rounding: look just above rounding.
         steps = 4e-4 * 0.5 ** np.arange(11)
         remainders = np.array([abs(at(h) - base - h * derivative) for h in steps])
-        # Contact amplifies rounding, most with Trapezoidal: some 3 % of the floor were seen.
-        floor = 80 * ROUNDING * max(abs(base), abs(derivative))
+        # Trapezoidal amplifies rounding at contact.
+        amplification = 80 if isinstance(scheme, jc.Trapezoidal) else 20
+        floor = amplification * ROUNDING * max(abs(base), abs(derivative))
         usable = remainders[: int(np.argmax(np.append(remainders <= floor, True)))]
         is_cut = usable.size < steps.size
         if usable.size < 3 or (is_cut and usable[-1] > 16 * floor):
