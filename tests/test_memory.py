@@ -13,8 +13,8 @@ FACTOR = 2.0
 DT = 0.2
 
 
-def make_system(material=None):
-    mesh = jc.meshes.rectangle((1.0, 1.0), h=1 / 5)
+def make_system(material=None, h=1 / 5):
+    mesh = jc.meshes.rectangle((1.0, 1.0), h=h)
     plane = jc.HalfSpace(np.array([0.0, -0.02]), np.array([0.0, 1.0]))
     material = jc.KelvinVoigt(young=1.0, poisson=0.3) if material is None else material
     return jc.discretize(jc.Scene(mesh, material, contact={"bottom": plane}))
@@ -81,7 +81,8 @@ def test_estimate_memory_is_within_a_factor_of_two(stepper, kind, save_every, ch
 
 def material_gradient_bytes(steps, **options):
     def objective(young):
-        system = make_system(jc.KelvinVoigt(young=young, poisson=0.3))
+        # States outweigh the two booleans per pair that are recorded of every step.
+        system = make_system(jc.KelvinVoigt(young=young, poisson=0.3), h=1 / 12)
         stepper = jc.prepare(system, DT, linear_solver=jc.Dense())
         return final_misfit(jc.simulate(stepper, steps=steps, initial=throw(system), **options))
 
@@ -95,13 +96,13 @@ def test_checkpointed_material_gradient_takes_memory_as_the_square_root_of_the_s
         material_gradient_bytes(m * m, save_every=int(m), checkpoint=jc.Checkpoint(int(m)))
         for m in roots
     ]
-    # The growth: four times the steps, at most twice the memory.
+    # What comes with four times the steps: twice as much with checkpoints, else four times.
     first, second = np.diff(split)
-    assert 0 < second < 2.5 * first
-    assert split[-1] < 4.0 * split[0]
-    stored = [material_gradient_bytes(m * m, save_every=int(m)) for m in roots[1:]]
-    assert stored[1] > 3.0 * stored[0]
-    assert stored[1] > 5.0 * split[-1]
+    assert 0 < second < 2.2 * first
+    stored = [material_gradient_bytes(m * m, save_every=int(m)) for m in roots]
+    first, second = np.diff(stored)
+    assert second > 3.8 * first
+    assert stored[-1] > 5.0 * split[-1]
 
 
 def test_estimate_memory_of_a_checkpoint_grows_as_the_square_root(stepper):

@@ -220,9 +220,22 @@ def _batch_cost(tree):
     return LAUNCH_COST + COMPILE_COST * sum(int((s * (s + 2 * b)).sum()) for s, b in sizes)
 
 
-def _batch(own, boundary, batch_cost, n_cuts=12):
-    """Split fronts into batches of similar size: batch of each front (F,), and the cost."""
-    order = np.argsort(own * (own + 2 * boundary), kind="stable")
+def _batch(own, boundary, batch_cost):
+    """Split fronts into batches of similar size: batch of each front (F,), and the cost.
+
+    Fronts are sorted by their work, by their own or by their boundary unknowns, whichever is best.
+    """
+    orders = (
+        np.argsort(own * (own + 2 * boundary), kind="stable"),
+        np.lexsort((boundary, own)),
+        np.lexsort((own, boundary)),
+    )
+    splits = [_split(order, own, boundary, batch_cost) for order in orders]
+    return min(splits, key=lambda split: split[1])
+
+
+def _split(order, own, boundary, batch_cost, n_cuts=24):
+    """Cut a sequence of fronts into batches by dynamic programming."""
     cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
     s = round_up(np.maximum.reduceat(own[order], cuts[:-1]))
     b = np.maximum.reduceat(boundary[order], cuts[:-1])

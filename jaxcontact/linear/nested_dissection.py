@@ -215,9 +215,9 @@ def _sum_sources(update, sources):
 def _materialize(x, origin):
     """Return x as a buffer of its own.
 
-    XLA fuses the producer of x into every gather of a sweep: for a right-hand side some thirty
-    scattered reads per entry, for the solution of several stages a chain of selects. It drops
-    optimization barriers on CPUs; an update at an index that it does not know stops it.
+    XLA fuses the producer of a right-hand side into every gather of a sweep, some thirty scattered
+    reads per entry. It drops optimization barriers on CPUs; an update at an index that it does not
+    know stops it.
     """
     return jax.lax.dynamic_update_slice_in_dim(x, x[:1], origin, axis=0)
 
@@ -247,14 +247,21 @@ def _up(factor, rhs) -> Partial:
 
 def _down(factor, values, root) -> Array:
     """Sweep from the root, with its solution (s,), to the leaves."""
-    solution = root
+    tail = root.shape[1:]
+    n_values = sum(z.shape[0] * z.shape[1] for z in jax.tree.leaves(values))
+    solution = jnp.concatenate([root, jnp.zeros((n_values, *tail), root.dtype)])
+    place = root.shape[0]
     for stage, stage_values in zip(factor.stages[::-1], values[::-1], strict=True):
-        found = [solution]
+        found = []
         for batch, z in zip(stage, stage_values, strict=True):
             later = take(solution, batch.boundary)
             y = z - jnp.einsum("fbj,fb...->fj...", batch.coupling, later)
-            found.append(y.reshape(-1, *root.shape[1:]))
-        solution = _materialize(jnp.concatenate(found), factor.origin)
+            found.append(y.reshape(-1, *tail))
+        # In place: nothing reads the old solution after this.
+        solution = jax.lax.dynamic_update_slice_in_dim(
+            solution, jnp.concatenate(found), place, axis=0
+        )
+        place += sum(y.shape[0] for y in found)
     return take(solution, factor.places)
 
 
