@@ -1,6 +1,7 @@
 """How much does a contact step cost, and how far is it from the memory limit?
 
-Times a full contact step (forward, inside one compiled scan) against the number of unknowns. The
+Times a full contact step (forward, inside one compiled scan) against the number of unknowns, with
+the motion recorded after every step and with the last state alone (`save_every`). The
 limit is the time to read the nonzeros of the Cholesky factor twice, once for the sweep up and once
 for the sweep down, without padding: two dot products of a buffer of that size, in turns with the
 steps of the same run. Conjugate gradients have no factor and no limit. The peak memory is that of
@@ -55,7 +56,11 @@ def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeat
     def run(stepper: jc.Stepper, initial: jc.State) -> jc.Trajectory:
         return jc.simulate(stepper, steps=steps, initial=initial)
 
+    def run_bare(stepper: jc.Stepper, initial: jc.State) -> jc.Trajectory:
+        return jc.simulate(stepper, steps=steps, initial=initial, save_every=steps)
+
     program, compile_s = measure.compiled(run, stepper, body.initial)
+    bare, _ = measure.compiled(run_bare, stepper, body.initial)
     contact = speed_scenes.check(program(stepper, body.initial))
     entries = factor_entries(body) if solver != "cg" else 0
     buffer = np.ones(entries, dtype)
@@ -64,7 +69,10 @@ def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeat
         for _ in range(2 * steps):
             np.dot(buffer, buffer)
 
-    runs = {"step": lambda: program(stepper, body.initial)} | ({"limit": stream} if entries else {})
+    runs = {
+        "step": lambda: program(stepper, body.initial),
+        "bare": lambda: bare(stepper, body.initial),
+    } | ({"limit": stream} if entries else {})
     seconds = measure.interleaved_seconds(runs, repeats)
     limit = seconds.get("limit")
     return {
@@ -72,8 +80,10 @@ def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeat
         **body.sizes,
         "factor_entries": entries,
         "step_us": 1e6 * seconds["step"] / steps,
+        "bare_us": 1e6 * seconds["bare"] / steps,
         "limit_us": limit and 1e6 * limit / steps,
         "step_over_limit": limit and seconds["step"] / limit,
+        "bare_over_limit": limit and seconds["bare"] / limit,
         "prepare_s": prepare_s,
         "prepare_again_s": prepare_again_s,
         "compile_s": compile_s,
