@@ -20,6 +20,10 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+MAX_UNROLLED = 4
+"""Columns that are summed one by one: for a reduction over a few, XLA's CPU compiler calls a
+library that is ten times slower."""
+
 _product = Primitive("symmetric_product")
 
 
@@ -51,14 +55,33 @@ def outer_on_pattern(columns: Array | np.ndarray | None, left: Array, right: Arr
         return jnp.outer(left, right) if left.ndim == 1 else left @ right.T
     n, n_nodes = left.shape[0], columns.shape[1]
     left, right = (x.reshape(n_nodes, n // n_nodes, -1) for x in (left, right))
-    right = jnp.swapaxes(take(right, columns), 1, 2)  # (slot, column component, row, r)
-    outer = jnp.sum(right[:, :, :, None] * left[None, None], axis=-1)
+    right = jnp.swapaxes(take(right, columns), 1, 2)[:, :, :, None]
+    left = left[None, None]  # (slot, column component, row, row component, r), as right
+    r = left.shape[-1]
+    if r <= MAX_UNROLLED:
+        outer = sum(right[..., k] * left[..., k] for k in range(r))
+    else:
+        outer = jnp.sum(right * left, axis=-1)
     return outer.reshape(-1, n)
 
 
 def take(x: Array, index: Array | np.ndarray) -> Array:
     """Return x[index] along the first axis for an index that is known to be in bounds."""
     return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def materialize(x: Array, zero: Array) -> Array:
+    """Return x as a buffer of its own.
+
+    XLA fuses the producer of a vector into every gather from it, some thirty scattered reads per
+    entry. It drops optimization barriers on CPUs; an update at an index that it does not know
+    stops it.
+
+    Args:
+        x: vector (n,) or columns (n, r).
+        zero: 0, () int32, as a number that the compiler cannot know.
+    """
+    return jax.lax.dynamic_update_slice_in_dim(x, x[:1], zero, axis=0)
 
 
 def _gathered_product(values: Array, columns: Array | np.ndarray, x: Array) -> Array:
@@ -107,7 +130,8 @@ def _batch(arguments, axes, *, is_transposed):
     if values_axis is None and columns_axis is None:
         # One product with more columns, which reads the entries once.
         x = jnp.moveaxis(x, x_axis, -1)
-        x_columns = x.reshape(x.shape[0], -1)
+        zero = jnp.minimum(columns[0, 0], 0)
+        x_columns = materialize(x.reshape(x.shape[0], -1), zero)
         product = _product.bind(values, columns, x_columns, is_transposed=is_transposed)
         return product.reshape(x.shape), x.ndim - 1
     return jax.vmap(_gathered_product, in_axes=axes)(values, columns, x), 0

@@ -28,6 +28,7 @@ from jax import Array
 from jaxcontact.linear.dissection_numeric import condense_root, factorize_fronts
 from jaxcontact.linear.dissection_plan import plan_for
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix, take, unknown_columns
+from jaxcontact.symmetric_product import materialize
 
 
 class FrontBatch(NamedTuple):
@@ -212,19 +213,9 @@ def _sum_sources(update, sources):
     return total
 
 
-def _materialize(x, origin):
-    """Return x as a buffer of its own.
-
-    XLA fuses the producer of a right-hand side into every gather of a sweep, some thirty scattered
-    reads per entry. It drops optimization barriers on CPUs; an update at an index that it does not
-    know stops it.
-    """
-    return jax.lax.dynamic_update_slice_in_dim(x, x[:1], origin, axis=0)
-
-
 def _up(factor, rhs) -> Partial:
     """Sweep from the leaves to the root."""
-    rhs = _materialize(rhs, factor.origin)
+    rhs = materialize(rhs, factor.origin)
     values, update = [], None
     for stage in factor.stages:
         stage_values, updates = [], []
