@@ -25,6 +25,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.linear.triangular import invert_triangular
+
 #: A set that differs in more than C / 8 pairs is factorised anew: an exchange reads and writes the
 #: matrix once, a factorisation costs about as much as C / 8 of them.
 PAIRS_PER_EXCHANGE = 8
@@ -108,8 +110,9 @@ def _transform(compliance: Array, pairs: Array) -> Array:
     identity = jnp.eye(pairs.shape[0], dtype=compliance.dtype)
     inside = pairs[:, None] & pairs[None, :]
     across = jnp.where(pairs[:, None] & ~pairs[None, :], scaled, 0.0)
-    factor = jax.scipy.linalg.cho_factor(jnp.where(inside, scaled, identity), lower=True)
-    inverse = jnp.where(inside, jax.scipy.linalg.cho_solve(factor, identity), 0.0)
+    L = jax.lax.linalg.cholesky(jnp.where(inside, scaled, identity), symmetrize_input=False)
+    L_inverse = invert_triangular(L[None])[0]
+    inverse = jnp.where(inside, L_inverse.T @ L_inverse, 0.0)
     elimination = inverse @ across
     outside = ~pairs[:, None] & ~pairs[None, :]
     rest = jnp.where(outside, scaled, 0.0) - across.T @ elimination

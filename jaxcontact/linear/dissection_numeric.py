@@ -16,10 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.linear.dissection_layout import BatchPlan
+from jaxcontact.linear.triangular import invert_triangular
 from jaxcontact.sparse import take
-
-_MAX_DOUBLING = 256
-"""Largest triangular matrix that is inverted by doubling; its work is log2(s) / 2 times larger."""
 
 
 @jax.jit
@@ -95,32 +93,9 @@ def _eliminate(own_columns, rest):
     """S11^-1, V, the Schur complement and the pivots (diagonal of L) of a batch."""
     s = own_columns.shape[2]
     L = jax.lax.linalg.cholesky(own_columns[:, :s], symmetrize_input=False)
-    L_inverse = _invert_triangular(L)
+    L_inverse = invert_triangular(L)
     W = jnp.einsum("fbj,fij->fbi", own_columns[:, s:], L_inverse)
     inverse = jnp.einsum("fij,fik->fjk", L_inverse, L_inverse)
     coupling = jnp.einsum("fbi,fij->fbj", W, L_inverse)
     complement = rest - jnp.einsum("fbi,fci->fbc", W, W)
     return inverse, coupling, complement, jnp.diagonal(L, axis1=1, axis2=2)
-
-
-def _invert_triangular(L):
-    """Invert lower triangular matrices, (F, s, s).
-
-    Diagonal blocks of doubling size are inverted together, by products only: the inverse of
-    [[A, 0], [B, C]] is that of diag(A, C) minus its product with B on both sides. XLA's triangular
-    solve is slow on CPUs for many small matrices; the large ones are few and left to it.
-    """
-    s = L.shape[-1]
-    if s > _MAX_DOUBLING:
-        identity = jnp.broadcast_to(jnp.eye(s, dtype=L.dtype), L.shape)
-        return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True)
-    diagonal = jnp.diagonal(L, axis1=1, axis2=2)
-    identity = jnp.eye(s, dtype=L.dtype)[None]
-
-    def double(k, inverse):
-        block = jnp.arange(s) >> k
-        is_pair = (block[:, None] == block[None, :] + 1) & (block[None, :] % 2 == 0)
-        B = jnp.where(is_pair[None], L, 0)
-        return inverse - jnp.einsum("fij,fjk->fik", inverse, jnp.einsum("fij,fjk->fik", B, inverse))
-
-    return jax.lax.fori_loop(0, (s - 1).bit_length(), double, identity / diagonal[:, None, :])
