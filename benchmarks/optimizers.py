@@ -154,7 +154,12 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
     columns = len({unknowns for _, unknowns in problems})
     lines = -(-len(problems) // columns)
     figure, axes = plt.subplots(
-        lines, columns, figsize=(4.2 * columns, 3.6 * lines), squeeze=False, sharey=True
+        lines,
+        columns,
+        figsize=(4.2 * columns, 3.6 * lines),
+        squeeze=False,
+        sharey=True,
+        layout="constrained",
     )
     for panel, (steps, unknowns) in zip(axes.flat, problems, strict=False):
         chosen = [row for row in rows if (row["steps"], row["unknowns"]) == (steps, unknowns)]

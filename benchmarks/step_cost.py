@@ -109,7 +109,7 @@ def growth_exponents(rows: list[dict], smallest: int) -> dict[str, float]:
 
 
 def draw(rows: list[dict], out: Path) -> None:
-    """Draw step and limit against n."""
+    """Draw step, with and without the record of the motion, and limit against n."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6, 4.2))
@@ -117,8 +117,9 @@ def draw(rows: list[dict], out: Path) -> None:
         mine = [row for row in rows if row["shape"] == shape]
         n = [row["n"] for row in mine]
         (line,) = axes.loglog(n, [row["step_us"] for row in mine], "o-", label=shape)
-        limit = [row["limit_us"] for row in mine]
-        axes.loglog(n, limit, ":", color=line.get_color())
+        for key, style in (("bare_us", "--"), ("limit_us", ":")):
+            axes.loglog(n, [row[key] for row in mine], style, color=line.get_color())
+    axes.plot([], [], "k--", label="recording the last state only")
     axes.plot([], [], "k:", label="read the factor twice")
     axes.set(xlabel="unknowns", ylabel="time of a contact step [µs]")
     axes.legend()
