@@ -12,6 +12,7 @@ import scipy.sparse.linalg
 
 from jaxcontact.linear import dissection_plan
 from jaxcontact.linear.nested_dissection import NestedDissection
+from jaxcontact.linear.triangular import invert_triangular
 
 # Rounding of a direct solve: a few hundred ulp times a condition number below 1e4.
 ROUNDING = 1e-11
@@ -280,3 +281,12 @@ def test_dissection_plan_of_a_grid_has_fill_of_order_n_log_n():
         assert entries[m] < 7.75 * m**2 * np.log2(m)
         assert dissection_plan.estimate_memory(plan, 8) > 8 * entries[m]
     assert entries[64] < 4 * np.log2(64) / np.log2(32) * 1.1 * entries[32]
+
+
+@pytest.mark.parametrize("s", [1, 2, 33, 300])
+def test_inverse_of_a_triangular_matrix_times_the_matrix_is_the_identity(s):
+    L = np.tril(np.random.default_rng(s).normal(size=(2, s, s))) / s
+    L += 2.0 * np.eye(s)
+    inverse = invert_triangular(jnp.asarray(L))
+    np.testing.assert_allclose(inverse @ L, np.broadcast_to(np.eye(s), L.shape), atol=1e-13)
+    np.testing.assert_array_equal(np.triu(inverse, 1), 0.0)

@@ -206,7 +206,7 @@ def test_matrix_of_blocks_is_the_dense_one(d):
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
-@pytest.mark.parametrize("r", [None, 2])
+@pytest.mark.parametrize("r", [None, 2, 6])
 def test_gradient_by_the_entries_of_blocks_is_the_outer_product_on_the_pattern(d, r):
     _, matrix = random_blocks(d)
     shape = (6 * d,) if r is None else (6 * d, r)
