@@ -59,7 +59,8 @@ def outer_on_pattern(columns: Array | np.ndarray | None, left: Array, right: Arr
     left = left[None, None]  # (slot, column component, row, row component, r), as right
     r = left.shape[-1]
     if r <= MAX_UNROLLED:
-        outer = sum(right[..., k] * left[..., k] for k in range(r))
+        products = [right[..., k] * left[..., k] for k in range(r)]
+        outer = sum(products[1:], products[0])
     else:
         outer = jnp.sum(right * left, axis=-1)
     return outer.reshape(-1, n)
