@@ -100,29 +100,40 @@ def error_of_step(factor, matrix, normals, seed=2):
     return max(relative_error(*pair) for pair in pairs)
 
 
+@pytest.fixture(autouse=True, params=[True, False], ids=["leaves", "no leaves"])
+def with_leaves(request, monkeypatch):
+    """Run every test with and without the sparse coupling of the lowest fronts."""
+    monkeypatch.setattr(dissection_plan, "COUPLING_COST", -np.inf if request.param else np.inf)
+    dissection_plan._PLANS.clear()
+    return request.param
+
+
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize(("shape", "block"), [((300,), 1), ((19, 14), 2), ((6, 7, 5), 3)])
-def test_nested_dissection_agrees_with_sparse_direct_solver(shape, block, with_points):
+def test_nested_dissection_agrees_with_sparse_direct_solver(shape, block, with_points, with_leaves):
     matrix, normals, coordinates = problem(shape, block, with_points)
     factor = NestedDissection(leaf_size=16).factorize(padded_rows(matrix), normals, coordinates)
-    assert len(factor.stages) >= 1
+    assert (len(factor.leaves) > 0) == with_leaves
+    assert len(factor.leaves) + len(factor.stages) > 0
     assert error_of_step(factor, matrix, normals) < ROUNDING
 
 
-def test_nested_dissection_leaf_size_does_not_change_the_solution(monkeypatch):
+def test_nested_dissection_leaf_size_does_not_change_the_solution(monkeypatch, with_leaves):
     # Cheap launches keep more depths of the tree and more sizes apart.
     monkeypatch.setattr(dissection_plan, "LAUNCH_COST", 1000)
     matrix, normals, coordinates = problem((11, 10), 2)
     for leaf_size in (20, 1000):
         solver = NestedDissection(leaf_size=leaf_size)
         factor = solver.factorize(padded_rows(matrix), normals, coordinates)
+        assert bool(factor.leaves) == with_leaves
+        assert len(factor.stages) > 0 or leaf_size == 1000
         assert error_of_step(factor, matrix, normals) < ROUNDING
 
 
 def test_nested_dissection_of_less_than_a_leaf_is_one_front():
     matrix, normals, coordinates = problem((3, 3), 2)
     factor = NestedDissection().factorize(padded_rows(matrix), normals, coordinates)
-    assert factor.stages == ()
+    assert factor.leaves == factor.stages == ()
     assert error_of_step(factor, matrix, normals) < ROUNDING
 
 

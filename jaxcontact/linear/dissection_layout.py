@@ -8,6 +8,9 @@ front matrices.
 
 The updates (boundary values of all fronts) of one stage are stored one after the other with one
 zero behind them, the place of every contribution that does not exist; so are its Schur complements.
+The own values of all fronts are stored one after the other, from the root to the lowest stage: the
+*positions*. Where the lowest stage are *leaves*, they act on later unknowns by the sparse matrix
+itself and pass no updates on.
 """
 
 from __future__ import annotations
@@ -25,9 +28,10 @@ class BatchPlan(NamedTuple):
     is_padding: np.ndarray
     """True where an own position is padding, (F, s) bool."""
     boundary: np.ndarray
-    """Place of each boundary value in the solution of the later stages, (F, b)."""
+    """Position of each boundary unknown, (F, b)."""
     sources: np.ndarray
-    """Places in the update of the earlier stage that add up in each position, (K, F, s + b)."""
+    """Places in the update of the earlier stage that add up in each position, (K, F, s + b); none
+    for the leaves and above them."""
     entries: np.ndarray
     """Places in the matrix values and in the own columns (F, s + b, s) they belong to, (2, E)."""
     child_base: np.ndarray
@@ -36,6 +40,18 @@ class BatchPlan(NamedTuple):
     """Row length of that Schur complement, (J, F)."""
     child_position: np.ndarray
     """Position of each position in the child's boundary, (J, F, s + b); -1 if it is not there."""
+
+
+class CouplingPlan(NamedTuple):
+    """Index maps (int32) of the matrix entries that couple P positions to the other side.
+
+    The positions are those of the leaves or those of the rest, each with up to w entries.
+    """
+
+    entries: np.ndarray
+    """Place of each entry in the matrix values, (w, P); one behind them if there is none."""
+    columns: np.ndarray
+    """Position of its column, counted from the first of the other side, (w, P)."""
 
 
 class Stage(NamedTuple):
@@ -54,9 +70,10 @@ class Stage(NamedTuple):
     schur: np.ndarray
     """Place of the Schur complement among those of the stage."""
     n_schur: int
-    solution: np.ndarray
-    """Place of the first own value in the solution of all stages, root first."""
-    n_solution: int
+    position: np.ndarray
+    """Position of the first own unknown."""
+    n_positions: int
+    """Positions of this stage and of those nearer to the root."""
     keys: np.ndarray
     """front * n + rank of each boundary unknown, ascending."""
     unknowns: np.ndarray
@@ -82,7 +99,7 @@ def round_up(n_own):
     return -(-n_own // 4) * 4
 
 
-def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Stage:
+def make_stage(n_own, n_boundary, batch, keys, unknowns, first_position) -> Stage:
     """Lay out the fronts of one stage.
 
     Args:
@@ -91,7 +108,7 @@ def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Sta
         batch: batch of each front, (F,).
         keys: front * n + rank of each boundary unknown, ascending.
         unknowns: boundary unknowns in the same order.
-        solution_offset: places taken by the stages nearer to the root.
+        first_position: positions taken by the stages nearer to the root.
     """
     s_max = np.zeros(batch.max() + 1, np.int64)
     b_max = np.zeros(batch.max() + 1, np.int64)
@@ -110,7 +127,7 @@ def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Sta
 
     update, n_updates = offsets(b)
     schur, n_schur = offsets(b * b)
-    solution, n_solution = offsets(s)
+    position, n_positions = offsets(s)
     return Stage(
         n_own=n_own,
         n_boundary=n_boundary,
@@ -122,50 +139,84 @@ def make_stage(n_own, n_boundary, batch, keys, unknowns, solution_offset) -> Sta
         n_updates=n_updates,
         schur=schur,
         n_schur=n_schur,
-        solution=solution + solution_offset,
-        n_solution=n_solution + solution_offset,
+        position=position + first_position,
+        n_positions=n_positions + first_position,
         keys=keys,
         unknowns=unknowns,
     )
 
 
-def places(stages, unknowns) -> np.ndarray:
-    """Place of each unknown in the solution of all stages, (n,)."""
-    place = np.empty(len(unknowns.stage), np.int64)
+def positions(stages, unknowns) -> np.ndarray:
+    """Position of each unknown, (n,)."""
+    position = np.empty(len(unknowns.stage), np.int64)
     for number, stage in enumerate(stages):
         here = np.flatnonzero(unknowns.stage == number)
-        place[here] = stage.solution[unknowns.front[here]] + unknowns.local[here]
-    return place
+        position[here] = stage.position[unknowns.front[here]] + unknowns.local[here]
+    return position
 
 
-def lay_out(stages, unknowns, columns) -> tuple[tuple[BatchPlan, ...], ...]:
-    """Return the batches of every stage, leaves first.
+def couple_leaves(stages, unknowns, columns) -> tuple[CouplingPlan, CouplingPlan]:
+    """Return the matrix entries in rows of the rest and columns of the leaves, and the transpose.
 
     Args:
-        stages: stages from the root to the leaves.
+        stages: stages from the root to the lowest, the leaves.
         unknowns: where each unknown is eliminated.
         columns: (width, n) columns of the matrix.
     """
-    place = places(stages, unknowns)
-    children = [*stages[1:], None]
+    position = positions(stages, unknowns)
+    n_rest, n_positions = stages[-2].n_positions, stages[-1].n_positions
+    is_leaf = unknowns.stage == len(stages) - 1
+
+    def coupling(is_row, first_row, n_rows, first_column):
+        width, n = columns.shape
+        is_entry = is_row & ~is_row[columns]
+        rows = np.flatnonzero(is_row)
+        count = is_entry[:, rows].sum(0)
+        slot = np.argsort(~is_entry[:, rows], axis=0, kind="stable")[: count.max(initial=1)]
+        is_filled = np.arange(len(slot))[:, None] < count
+        entries = np.full((len(slot), n_rows), width * n)
+        entries[:, position[rows] - first_row] = np.where(is_filled, slot * n + rows, width * n)
+        column = np.zeros_like(entries)
+        other = position[columns[slot, rows]] - first_column
+        column[:, position[rows] - first_row] = np.where(is_filled, other, 0)
+        return CouplingPlan(_int32(entries), _int32(column))
+
+    to_rest = coupling(~is_leaf, 0, n_rest, n_rest)
+    to_leaves = coupling(is_leaf, n_rest, n_positions - n_rest, 0)
+    return to_rest, to_leaves
+
+
+def lay_out(stages, unknowns, columns, with_leaves) -> tuple[tuple[BatchPlan, ...], ...]:
+    """Return the batches of every stage, the lowest first.
+
+    Args:
+        stages: stages from the root to the lowest.
+        unknowns: where each unknown is eliminated.
+        columns: (width, n) columns of the matrix.
+        with_leaves: whether the lowest stage are leaves.
+    """
+    position = positions(stages, unknowns)
+    above_leaves = len(stages) - 2 if with_leaves else -1
     batches = [
-        tuple(_stage_batches(number, stage, child, unknowns, place, columns))
-        for number, (stage, child) in enumerate(zip(stages, children, strict=True))
+        tuple(_stage_batches(stages, number, unknowns, position, columns, number == above_leaves))
+        for number in range(len(stages))
     ]
     return tuple(batches[::-1])
 
 
-def _stage_batches(number, stage, child, unknowns, place, columns):
+def _stage_batches(stages, number, unknowns, position, columns, is_above_leaves):
+    stage = stages[number]
     n = columns.shape[1]
     here = np.flatnonzero(unknowns.stage == number)
     boundary_front = stage.keys // n
     starts = np.cumsum(stage.n_boundary) - stage.n_boundary
     boundary_local = np.arange(len(stage.keys)) - starts[boundary_front]
     entry_front, entry_row, entry_column, entry_value = _entries(number, stage, unknowns, columns)
-    if child is None:
+    if number == len(stages) - 1:
         child = stage._replace(keys=stage.keys[:0], unknowns=stage.unknowns[:0], n_updates=0)
         n_children = 0
     else:
+        child = stages[number + 1]
         n_children = len(child.s) // len(stage.s)
     child_front = child.keys // n
     child_starts = np.cumsum(child.n_boundary) - child.n_boundary
@@ -184,19 +235,22 @@ def _stage_batches(number, stage, child, unknowns, place, columns):
         boundary = np.zeros((n_fronts, b), np.int32)
         mine = np.flatnonzero(stage.batch[boundary_front] == label)
         slot = stage.index[boundary_front[mine]], boundary_local[mine]
-        boundary[slot] = place[stage.unknowns[mine]]
+        boundary[slot] = position[stage.unknowns[mine]]
 
         mine = np.flatnonzero(stage.batch[entry_front] == label)
         target = stage.index[entry_front[mine]] * (s + b) + entry_row[mine]
         entries = np.stack([entry_value[mine], target * s + entry_column[mine]])
 
         mine = np.flatnonzero(stage.batch[parent] == label)
+        child_position = np.full((n_children, n_fronts, s + b), -1, np.int32)
+        slot = stage.index[parent[mine]], parent_local[mine]
+        number_of_child = child_front[mine] - parent[mine] * n_children
+        child_position[number_of_child, *slot] = child_local[mine]
+        if is_above_leaves:
+            mine = mine[:0]
         target = stage.index[parent[mine]] * (s + b) + parent_local[mine]
         source = child.update[child_front[mine]] + child_local[mine]
         sources = _by_multiplicity(target, source, n_fronts * (s + b), child.n_updates)
-        position = np.full((n_children, n_fronts, s + b), -1, np.int32)
-        number_of_child = child_front[mine] - parent[mine] * n_children
-        position[number_of_child, stage.index[parent[mine]], parent_local[mine]] = child_local[mine]
         siblings = fronts[None, :] * n_children + np.arange(n_children)[:, None]
         yield BatchPlan(
             own=own,
@@ -206,7 +260,7 @@ def _stage_batches(number, stage, child, unknowns, place, columns):
             entries=_int32(entries),
             child_base=_int32(child.schur[siblings]),
             child_stride=_int32(child.b[siblings]),
-            child_position=position,
+            child_position=child_position,
         )
 
 

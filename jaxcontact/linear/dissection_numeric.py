@@ -11,6 +11,8 @@ later front, NaN.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -20,21 +22,25 @@ from jaxcontact.linear.triangular import invert_triangular
 from jaxcontact.sparse import take
 
 
-@jax.jit
-def factorize_fronts(values: Array, stages: tuple[tuple[BatchPlan, ...], ...]):
+@partial(jax.jit, static_argnames="with_leaves")
+def factorize_fronts(
+    values: Array, stages: tuple[tuple[BatchPlan, ...], ...], *, with_leaves: bool
+):
     """Factorise all fronts.
 
     Args:
         values: entries of the matrix, (width, n).
-        stages: batches of fronts, leaves first, the root last.
+        stages: batches of fronts, from the bottom; the root last.
+        with_leaves: whether the first stage are leaves, which need no V.
 
     Returns:
-        Pairs (S11^-1 (F, s, s), V (F, b, s)) of every batch but the root's; S11^-1 of the root,
-        (s, s); True if all pivots are positive, () bool.
+        S11^-1, (F, s, s), of every batch, by stages; V, (F, b, s), of every batch, by stages, but
+        nothing for the leaves; True if all pivots are positive, () bool.
     """
-    blocks, schur, is_positive = [], jnp.zeros(1, values.dtype), jnp.array(True)
+    inverses, couplings = [], []
+    schur, is_positive = jnp.zeros(1, values.dtype), jnp.array(True)
     for stage in stages:
-        stage_blocks, complements = [], []
+        stage_inverses, stage_couplings, complements = [], [], []
         for batch in stage:
             own_columns, rest = _assemble(batch, values, schur)
             inverse, coupling, complement, pivots = _eliminate(own_columns, rest)
@@ -42,11 +48,15 @@ def factorize_fronts(values: Array, stages: tuple[tuple[BatchPlan, ...], ...]):
             # XLA's CPU runtime may deadlock when several batched LAPACK calls run at once.
             values = values + 0 * jnp.min(pivots)
             is_positive &= jnp.all(pivots > 0)
-            stage_blocks.append((inverse, coupling))
+            stage_inverses.append(inverse)
+            stage_couplings.append(coupling)
             complements.append(complement.reshape(-1))
         schur = jnp.concatenate([*complements, jnp.zeros(1, values.dtype)])
-        blocks.append(tuple(stage_blocks))
-    return tuple(blocks[:-1]), blocks[-1][0][0][0], is_positive
+        inverses.append(tuple(stage_inverses))
+        couplings.append(tuple(stage_couplings))
+    if with_leaves:
+        couplings[0] = ()
+    return tuple(inverses), tuple(couplings), is_positive
 
 
 @jax.jit

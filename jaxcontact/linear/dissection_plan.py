@@ -2,8 +2,9 @@
 
 Depths of the separator tree are merged into stages; the nodes that one part eliminates at one stage
 are a *front* with s own unknowns and b boundary unknowns (later unknowns coupled to it). A solve
-streams s (s + 2 b) numbers per front. Fronts of a stage are padded to one size and become one
-batched product, or a few where sizes differ. Stages and batches minimise
+streams s (s + 2 b) numbers per front, and 2 s^2 per leaf, whose coupling to the boundary is sparse.
+Fronts of a stage are padded to one size and become one batched product, or a few where sizes
+differ. Stages and batches minimise
 
     numbers streamed + batch cost * number of batches.
 
@@ -21,16 +22,28 @@ from jax.core import Tracer
 
 from jaxcontact.linear.dissection_layout import (
     BatchPlan,
+    CouplingPlan,
     Unknowns,
+    couple_leaves,
     lay_out,
     make_stage,
-    places,
+    positions,
     round_up,
 )
 from jaxcontact.linear.dissection_order import dissect, hop_coordinates
 
 LAUNCH_COST = 10_000
 """Time of the kernels of one batch, in numbers streamed in that time (some 2 us on a CPU)."""
+
+LEAF_COST = 1.0
+"""Time to stream the two inverses of a leaf, in numbers streamed per entry: the sum over the rows
+of many small matrices is shared between the cores, unlike the products of larger fronts."""
+
+COUPLING_COST = 30_000
+"""Time of the kernels of the sparse coupling, in numbers streamed in that time."""
+
+LEAF_BOUNDARY = 0.1
+"""Weight of the boundary of a leaf, which costs time in the factorisation alone."""
 
 COMPILE_COST = 0.003
 """Share of the streamed numbers that a batch must save to be worth its compilation."""
@@ -40,9 +53,14 @@ class DissectionPlan(NamedTuple):
     """Everything about a factorisation that the sparsity pattern decides."""
 
     stages: tuple[tuple[BatchPlan, ...], ...]
-    """Batches of each stage; the first stage are the leaves, the last is the root (one front)."""
-    places: np.ndarray
-    """Place of each unknown in the solution of all stages, root first, (n,) int32."""
+    """Batches of each stage, from the bottom; the last is the root (one front)."""
+    couplings: tuple[CouplingPlan, ...]
+    """Matrix entries in rows of the rest and columns of the first stage, and the transpose, if that
+    stage are leaves; else empty."""
+    unknown_of_position: np.ndarray
+    """Unknown at each position, (P,) int32; padding repeats unknown 0."""
+    position_of_unknown: np.ndarray
+    """Position of each unknown, root first, (n,) int32."""
     contact_places: np.ndarray
     """Position of each contact unknown in the root front, (C, k) int32."""
     n_factor_entries: int
@@ -53,12 +71,11 @@ class DissectionPlan(NamedTuple):
 
 def estimate_memory(plan: DissectionPlan, itemsize: int) -> int:
     """Return the bytes of a factor with numbers of `itemsize` bytes, index maps included."""
-    maps = sum(
-        batch.own.nbytes + batch.boundary.nbytes + batch.sources.nbytes
-        for stage in plan.stages
-        for batch in stage
-    )
-    return plan.n_stored * itemsize + maps + plan.places.nbytes
+    maps = [plan.unknown_of_position, plan.position_of_unknown]
+    for stage in plan.stages:
+        maps += [x for batch in stage for x in (batch.boundary, batch.sources)]
+    maps += [coupling.columns for coupling in plan.couplings]
+    return plan.n_stored * itemsize + sum(x.nbytes for x in maps)
 
 
 _PLANS: OrderedDict[bytes, DissectionPlan] = OrderedDict()
@@ -132,22 +149,32 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     else:
         points = coordinates[first]
     tree = _eliminate(dissect(half, points, sizes, is_contact[first], leaf_size), edges, sizes)
-    heads = _merge_depths(tree)
+    heads, with_leaves = _merge_depths(tree)
     where = _locate(tree, heads, node)
     stages = []
     for head, end in zip(heads, [*heads[1:], len(tree.own_size)], strict=True):
-        own = _own_size(tree, head, end)
+        own, boundary = _own_size(tree, head, end), tree.boundary_size[head]
         parts, nodes = tree.boundary[head]
         keys, members = _unknowns_of(parts, nodes, node, sizes, where.rank)
-        offset = stages[-1].n_solution if stages else 0
-        batch = _batch(own, tree.boundary_size[head], _batch_cost(tree))[0]
-        stages.append(make_stage(own, tree.boundary_size[head], batch, keys, members, offset))
+        first_position = stages[-1].n_positions if stages else 0
+        is_leaf = with_leaves and end == len(tree.own_size)
+        batch = _batch(own, boundary, is_leaf, _batch_cost(tree))[0]
+        stages.append(make_stage(own, boundary, batch, keys, members, first_position))
     root_places = where.local[unknowns].astype(np.int32)
+    position = positions(stages, where)
+    unknown_of_position = np.zeros(stages[-1].n_positions, np.int32)
+    unknown_of_position[position] = np.arange(n)
+    couplings = couple_leaves(stages, where, columns) if with_leaves else ()
     n_stored = sum(int((x.s * (x.s + x.b)).sum()) for x in stages)
+    if with_leaves:
+        n_stored -= int((stages[-1].s * stages[-1].b).sum())
+        n_stored += sum(coupling.entries.size for coupling in couplings)
     n_contact = len(unknowns)
     return DissectionPlan(
-        stages=lay_out(stages, where, columns),
-        places=places(stages, where).astype(np.int32),
+        stages=lay_out(stages, where, columns, with_leaves),
+        couplings=couplings,
+        unknown_of_position=unknown_of_position,
+        position_of_unknown=position.astype(np.int32),
         contact_places=root_places,
         n_factor_entries=_count_entries(tree),
         n_stored=n_stored + n_contact * (int(stages[0].s[0]) + n_contact),
@@ -193,8 +220,21 @@ def _eliminate(dissection, edges, sizes) -> _Tree:
     return _Tree(depth, part, rank, boundary[::-1], own_size[::-1], boundary_size[::-1])
 
 
-def _merge_depths(tree) -> list[int]:
-    """Choose the stages: the first depth of each, from the root, by dynamic programming."""
+def _merge_depths(tree) -> tuple[list[int], bool]:
+    """Choose the stages: the first depth of each, from the root; and whether the last are leaves.
+
+    The fronts at the bottom of a small tree are not worth the sparse coupling of leaves.
+    """
+    (cost, heads), (leaf_cost, leaf_heads) = (
+        _cheapest_stages(tree, leaf) for leaf in (False, True)
+    )
+    if len(leaf_heads) > 1 and leaf_cost + COUPLING_COST < cost:
+        return leaf_heads, True
+    return heads, False
+
+
+def _cheapest_stages(tree, with_leaves) -> tuple[float, list[int]]:
+    """Merge depths by dynamic programming: the cost, and the first depth of each stage."""
     n_depths = len(tree.own_size)
     batch_cost = _batch_cost(tree)
     best, choice = [0.0] * (n_depths + 1), [0] * (n_depths + 1)
@@ -202,16 +242,16 @@ def _merge_depths(tree) -> list[int]:
         own, costs = np.zeros_like(tree.own_size[head]), []
         for end in range(head + 1, n_depths + 1):
             own = own + tree.own_size[end - 1].reshape(len(own), -1).sum(1)
-            stage_cost = _batch(own, tree.boundary_size[head], batch_cost)[1]
-            costs.append(stage_cost + best[end])
-            if stage_cost > 4 * min(costs):
+            is_leaf = with_leaves and 0 < head and end == n_depths
+            costs.append(_batch(own, tree.boundary_size[head], is_leaf, batch_cost)[1] + best[end])
+            if (own**2).sum() > 4 * min(costs):
                 break
         best[head] = min(costs)
         choice[head] = head + 1 + int(np.argmin(costs))
     heads = [0]
     while choice[heads[-1]] < n_depths:
         heads.append(choice[heads[-1]])
-    return heads
+    return best[0], heads
 
 
 def _batch_cost(tree):
@@ -220,21 +260,25 @@ def _batch_cost(tree):
     return LAUNCH_COST + COMPILE_COST * sum(int((s * (s + 2 * b)).sum()) for s, b in sizes)
 
 
-def _batch(own, boundary, batch_cost):
+def _batch(own, boundary, is_leaf, batch_cost):
     """Split fronts into batches of similar size: batch of each front (F,), and the cost.
 
     Fronts are sorted by their work, by their own or by their boundary unknowns, whichever is best.
     """
+
+    def work(s, b):
+        return LEAF_COST * s * (s + LEAF_BOUNDARY * b) if is_leaf else s * (s + 2.0 * b)
+
     orders = (
-        np.argsort(own * (own + 2 * boundary), kind="stable"),
+        np.argsort(work(own, boundary), kind="stable"),
         np.lexsort((boundary, own)),
         np.lexsort((own, boundary)),
     )
-    splits = [_split(order, own, boundary, batch_cost) for order in orders]
+    splits = [_split(order, own, boundary, work, batch_cost) for order in orders]
     return min(splits, key=lambda split: split[1])
 
 
-def _split(order, own, boundary, batch_cost, n_cuts=24):
+def _split(order, own, boundary, work, batch_cost, n_cuts=24):
     """Cut a sequence of fronts into batches by dynamic programming."""
     cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
     s = round_up(np.maximum.reduceat(own[order], cuts[:-1]))
@@ -244,7 +288,7 @@ def _split(order, own, boundary, batch_cost, n_cuts=24):
         s_max = np.maximum.accumulate(s[:j][::-1])[::-1]
         b_max = np.maximum.accumulate(b[:j][::-1])[::-1]
         count = cuts[j] - cuts[:j]
-        costs = np.array(best) + batch_cost + count * s_max * (s_max + 2.0 * b_max)
+        costs = np.array(best) + batch_cost + count * work(s_max, b_max)
         best.append(costs.min())
         start.append(int(costs.argmin()))
     label, j = np.zeros(len(own), np.int64), len(cuts) - 1

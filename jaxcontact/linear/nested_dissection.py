@@ -5,7 +5,12 @@ A front with own unknowns 1 and boundary unknowns 2 (eliminated later) keeps two
     S11^-1   and   V = S21 S11^-1,
 
 and passes S22 - V S21^T to its parent. A solve goes up the tree with z = S11^-1 r_1 and the update
-r_2 - V r_1, and down with y_1 = z - V^T y_2. The contact unknowns lie in the root front, so that
+r_2 - V r_1, and down with y_1 = z - V^T y_2. At the bottom of a large tree are *leaves*, where
+S21 = D21, the sparse matrix itself, takes the place of V:
+
+    r_2 - D21 z   on the way up,   y_1 = z - S11^-1 D21^T y_2   on the way down;
+
+reading S11^-1 twice costs less than V. The contact unknowns lie in the root front, so that
 
     N D^-1 r = N_0 z_0,   and   y = D^-1 (r - N^T p)   has   y_0 = z_0 - S_0^-1 N_0^T p   (0: root):
 
@@ -30,27 +35,40 @@ from jaxcontact.linear.dissection_plan import plan_for
 from jaxcontact.sparse import ContactNormals, SymmetricMatrix, take, unknown_columns
 from jaxcontact.symmetric_product import materialize
 
+MAX_SUMMED_ROWS = 64
+"""Rows of a leaf that are summed one by one. XLA's CPU runtime shares such a sum between its
+threads, which it does not do with a batched matrix-vector product; compilation takes longer."""
+
 
 class FrontBatch(NamedTuple):
-    """F fronts of one stage, padded to s own and b boundary unknowns."""
+    """F fronts of one stage between leaves and root, padded to s own and b boundary unknowns."""
 
     inverse: Array
     """S11^-1, (F, s, s)."""
     coupling: Array
     """V = S21 S11^-1, (F, b, s)."""
-    own: Array
-    """Unknown of each own position, (F, s) int32."""
     boundary: Array
-    """Place of each boundary value in the solution of the later stages, (F, b) int32."""
+    """Position of each boundary unknown, (F, b) int32."""
     sources: Array
     """Places in the update of the earlier stage that add up in each position, (K, F, s + b)."""
+
+
+class LeafCoupling(NamedTuple):
+    """The matrix entries D21 in rows of the rest and columns of the leaves, or the transpose."""
+
+    entries: Array
+    """Up to w entries at each of P positions, (w, P)."""
+    columns: Array
+    """Position of the column of each entry, counted from the first of the other side, (w, P)."""
 
 
 class Partial(NamedTuple):
     """The result of the sweep up, with the trailing axes of the right-hand side."""
 
+    leaves: Array | None
+    """z = S11^-1 r_1 of all leaves, (P,), if there are any."""
     values: tuple[tuple[Array, ...], ...]
-    """z = S11^-1 r_1 of each batch but the root, (F, s), leaves first."""
+    """z of each batch between leaves and root, (F, s), the lowest stage first."""
     root: Array
     """z of the root front, (s,)."""
 
@@ -64,14 +82,17 @@ class DissectionFactor:
     Derivative: none defined here; callers treat a solve or a contact step as an implicit function.
     """
 
+    leaves: tuple[Array, ...]
+    """S11^-1 of each batch of leaves, (F, s, s)."""
+
+    couplings: tuple[LeafCoupling, ...]
+    """The matrix entries between the leaves and the rest: to the rest, and to the leaves."""
+
     stages: tuple[tuple[FrontBatch, ...], ...]
-    """Batches of all fronts but the root, leaves first."""
+    """Batches of the fronts between leaves and root, the lowest stage first."""
 
     root_inverse: Array
     """S11^-1 of the root front, (s, s)."""
-
-    root_own: Array
-    """Unknown of each position of the root front, (s,) int32."""
 
     root_sources: Array
     """Places in the update of the last stage that add up in each root position, (K, s) int32."""
@@ -88,8 +109,11 @@ class DissectionFactor:
     compliance: Array
     """N D^-1 N^T, (C, C)."""
 
-    places: Array
-    """Place of each unknown in the solution of all stages, root first, (n,) int32."""
+    unknown_of_position: Array
+    """Unknown at each own position of all fronts, root first, leaves last, (P,) int32."""
+
+    position_of_unknown: Array
+    """Its inverse, (n,) int32."""
 
     origin: Array
     """Zero, () int32; a number that the compiler cannot know."""
@@ -142,36 +166,44 @@ class NestedDissection:
             raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         columns = unknown_columns(matrix.columns, matrix.values.shape[1])
         plan = plan_for(columns, normals.unknowns, coordinates, self.leaf_size)
-        blocks, inverse, is_positive = factorize_fronts(matrix.values, plan.stages)
+        with_leaves = bool(plan.couplings)
+        inverses, couplings, is_positive = factorize_fronts(
+            matrix.values, plan.stages, with_leaves=with_leaves
+        )
+        (root,), (root_inverse,) = plan.stages[-1], inverses[-1]
         places = jnp.asarray(plan.contact_places)
-        response, compliance = condense_root(inverse, normals.weights, places)
+        response, compliance = condense_root(root_inverse[0], normals.weights, places)
+        between = slice(int(with_leaves), -1)
         stages = tuple(
             tuple(
-                FrontBatch(
-                    inverse=batch_blocks[0],
-                    coupling=batch_blocks[1],
-                    own=jnp.asarray(batch.own),
-                    boundary=jnp.asarray(batch.boundary),
-                    sources=jnp.asarray(batch.sources),
-                )
-                for batch, batch_blocks in zip(batches, stage_blocks, strict=True)
+                FrontBatch(*blocks, jnp.asarray(batch.boundary), jnp.asarray(batch.sources))
+                for *blocks, batch in zip(*stage, strict=True)
             )
-            for batches, stage_blocks in zip(plan.stages[:-1], blocks, strict=True)
+            for stage in zip(
+                inverses[between], couplings[between], plan.stages[between], strict=True
+            )
         )
-        (top,) = plan.stages[-1]
         return DissectionFactor(
+            leaves=inverses[0] if with_leaves else (),
+            couplings=tuple(_leaf_coupling(matrix.values, x) for x in plan.couplings),
             stages=stages,
-            root_inverse=inverse,
-            root_own=jnp.asarray(top.own[0]),
-            root_sources=jnp.asarray(top.sources[:, 0]),
+            root_inverse=root_inverse[0],
+            root_sources=jnp.asarray(root.sources[:, 0]),
             contact_weights=jnp.asarray(normals.weights),
             contact_places=places,
             contact_response=response,
             compliance=compliance,
-            places=jnp.asarray(plan.places),
+            unknown_of_position=jnp.asarray(plan.unknown_of_position),
+            position_of_unknown=jnp.asarray(plan.position_of_unknown),
             origin=jnp.zeros((), jnp.int32),
             is_positive=is_positive,
         )
+
+
+def _leaf_coupling(values, plan):
+    values = jnp.append(values, jnp.zeros((), values.dtype))
+    entries = take(values, jnp.asarray(plan.entries))
+    return LeafCoupling(entries, jnp.asarray(plan.columns))
 
 
 # Every sweep is written for right-hand sides (n,) and (n, r); the trailing axis stays last in all
@@ -213,36 +245,74 @@ def _sum_sources(update, sources):
     return total
 
 
+def _multiply_leaves(factor, x):
+    """Multiply values of all leaf positions, (P,), by S11^-1."""
+    tail, place, products = x.shape[1:], 0, []
+    for inverse in factor.leaves:
+        n_fronts, s, _ = inverse.shape
+        own = x[place : place + n_fronts * s].reshape(n_fronts, s, *tail)
+        place += n_fronts * s
+        if tail or s > MAX_SUMMED_ROWS:
+            product = jnp.einsum("fij,fj...->fi...", inverse, own)
+        else:
+            product = inverse[:, 0] * own[:, :1]
+            for i in range(1, s):
+                product = product + inverse[:, i] * own[:, i : i + 1]
+            product = materialize(product, factor.origin)
+        products.append(product.reshape(-1, *tail))
+    return jnp.concatenate(products)
+
+
+def _couple(coupling, x):
+    """Multiply values of the positions on one side by D21 or its transpose: those of the other."""
+    entries = coupling.entries.reshape(*coupling.entries.shape, *(1 for _ in x.shape[1:]))
+    product = entries[0] * take(x, coupling.columns[0])
+    for k in range(1, entries.shape[0]):
+        product = product + entries[k] * take(x, coupling.columns[k])
+    return product
+
+
 def _up(factor, rhs) -> Partial:
     """Sweep from the leaves to the root."""
-    rhs = materialize(rhs, factor.origin)
-    values, update = [], None
+    tail = rhs.shape[1:]
+    rhs = take(materialize(rhs, factor.origin), factor.unknown_of_position)
+    leaves = None
+    if factor.leaves:
+        rhs = materialize(rhs, factor.origin)
+        place = factor.couplings[0].entries.shape[1]
+        leaves = _multiply_leaves(factor, rhs[place:])
+        rhs = rhs[:place] - _couple(factor.couplings[0], leaves)
+        rhs = materialize(rhs, factor.origin)
+    place, values, update = rhs.shape[0], [], None
     for stage in factor.stages:
-        stage_values, updates = [], []
+        place -= sum(batch.inverse.shape[0] * batch.inverse.shape[1] for batch in stage)
+        end, stage_values, updates = place, [], []
         for batch in stage:
-            s = batch.own.shape[1]
-            own, passed = take(rhs, batch.own), 0.0
+            n_fronts, s, _ = batch.inverse.shape
+            start, end = end, end + n_fronts * s
+            own, passed = rhs[start:end].reshape(n_fronts, s, *tail), 0.0
             if update is not None:
                 own = own + _sum_sources(update, batch.sources[:, :, :s])
                 passed = _sum_sources(update, batch.sources[:, :, s:])
             stage_values.append(jnp.einsum("fij,fj...->fi...", batch.inverse, own))
             change = passed - jnp.einsum("fbj,fj...->fb...", batch.coupling, own)
-            updates.append(change.reshape(-1, *rhs.shape[1:]))
+            updates.append(change.reshape(-1, *tail))
         values.append(tuple(stage_values))
-        update = jnp.concatenate([*updates, jnp.zeros((1, *rhs.shape[1:]), rhs.dtype)])
-    own = take(rhs, factor.root_own)
+        update = jnp.concatenate([*updates, jnp.zeros((1, *tail), rhs.dtype)])
+    own = rhs[:place]
     if update is not None and factor.root_sources.shape[0]:
         own = own + _sum_sources(update, factor.root_sources)
-    return Partial(tuple(values), jnp.einsum("ij,j...->i...", factor.root_inverse, own))
+    root = jnp.einsum("ij,j...->i...", factor.root_inverse, own)
+    return Partial(leaves, tuple(values), root)
 
 
-def _down(factor, values, root) -> Array:
+def _down(factor, partial, root) -> Array:
     """Sweep from the root, with its solution (s,), to the leaves."""
     tail = root.shape[1:]
-    n_values = sum(z.shape[0] * z.shape[1] for z in jax.tree.leaves(values))
-    solution = jnp.concatenate([root, jnp.zeros((n_values, *tail), root.dtype)])
+    n_other = factor.unknown_of_position.shape[0] - root.shape[0]
+    solution = jnp.concatenate([root, jnp.zeros((n_other, *tail), root.dtype)])
     place = root.shape[0]
-    for stage, stage_values in zip(factor.stages[::-1], values[::-1], strict=True):
+    for stage, stage_values in zip(factor.stages[::-1], partial.values[::-1], strict=True):
         found = []
         for batch, z in zip(stage, stage_values, strict=True):
             later = take(solution, batch.boundary)
@@ -253,13 +323,17 @@ def _down(factor, values, root) -> Array:
             solution, jnp.concatenate(found), place, axis=0
         )
         place += sum(y.shape[0] for y in found)
-    return take(solution, factor.places)
+    if factor.leaves:
+        coupled = materialize(_couple(factor.couplings[1], solution), factor.origin)
+        y = partial.leaves - _multiply_leaves(factor, coupled)
+        solution = jax.lax.dynamic_update_slice_in_dim(solution, y, place, axis=0)
+    return take(solution, factor.position_of_unknown)
 
 
 @_with_trailing_axis
 def _solve(factor, rhs):
-    values, root = _up(factor, rhs)
-    return _down(factor, values, root)
+    partial = _up(factor, rhs)
+    return _down(factor, partial, partial.root)
 
 
 @_with_trailing_axis
@@ -272,4 +346,4 @@ def _condense(factor, rhs):
 @_with_trailing_axis
 def _expand(factor, partial, multiplier):
     correction = jnp.einsum("cj,c...->j...", factor.contact_response, multiplier)
-    return _down(factor, partial.values, partial.root - correction)
+    return _down(factor, partial, partial.root - correction)
