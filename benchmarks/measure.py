@@ -59,15 +59,18 @@ def seconds(function: Callable[[], Any], repeats: int = 5, budget: float = 10.0)
 def interleaved_seconds(
     functions: dict[str, Callable[[], Any]], repeats: int = 5, budget: float = 20.0
 ) -> dict[str, float]:
-    """Return median run times of functions that take turns, so that a busy machine hits all."""
-    for function in functions.values():
-        jax.block_until_ready(function())
+    """Return median run times of functions that take turns, so that a busy machine hits all.
+
+    A timed run follows an untimed one of the same function: the one before has left its own data
+    in the caches, and threads of a BLAS library that spin for a while and hold a core.
+    """
     times: dict[str, list[float]] = {name: [] for name in functions}
     begin = time.perf_counter()
     for turn in range(repeats):
         if turn >= 2 and time.perf_counter() - begin > budget:
             break
         for name, function in functions.items():
+            jax.block_until_ready(function())
             start = time.perf_counter()
             jax.block_until_ready(function())
             times[name].append(time.perf_counter() - start)

@@ -90,9 +90,17 @@ def _gathered_product(values: Array, columns: Array | np.ndarray, x: Array) -> A
     width, n_nodes = columns.shape
     d = values.shape[1] // n_nodes
     # Without the barrier XLA recomputes the producer of x inside every one of the gathers.
-    nodal = jax.lax.optimization_barrier(x).reshape(n_nodes, d, *x.shape[1:])
-    blocks = values.reshape(width, d, n_nodes, d, *(1 for _ in x.shape[1:]))
+    x = jax.lax.optimization_barrier(x)
     product = jnp.zeros((), x.dtype)
+    if x.ndim == 1 and d > 1:
+        # One loop over all unknowns: up to twice as fast on CPUs as one over d x d blocks.
+        for j in range(width):
+            first = jnp.broadcast_to(columns[j][:, None] * d, (n_nodes, d)).reshape(-1)
+            for component in range(d):
+                product = product + values[j * d + component] * take(x, first + component)
+        return product
+    nodal = x.reshape(n_nodes, d, *x.shape[1:])
+    blocks = values.reshape(width, d, n_nodes, d, *(1 for _ in x.shape[1:]))
     for j in range(width):
         neighbour = take(nodal, columns[j])
         for component in range(d):

@@ -176,8 +176,8 @@ class NestedDissection:
         between = slice(int(with_leaves), -1)
         stages = tuple(
             tuple(
-                FrontBatch(*blocks, jnp.asarray(batch.boundary), jnp.asarray(batch.sources))
-                for *blocks, batch in zip(*stage, strict=True)
+                FrontBatch(inverse, coupling, jnp.asarray(maps.boundary), jnp.asarray(maps.sources))
+                for inverse, coupling, maps in zip(*stage, strict=True)
             )
             for stage in zip(
                 inverses[between], couplings[between], plan.stages[between], strict=True
