@@ -39,6 +39,9 @@ LEAF_COST = 1.0
 """Time to stream the two inverses of a leaf, in numbers streamed per entry: the sum over the rows
 of many small matrices is shared between the cores, unlike the products of larger fronts."""
 
+LEAF_BATCH = 3
+"""Cost of a batch of leaves over that of another: its sums take longer to compile."""
+
 COUPLING_COST = 30_000
 """Time of the kernels of the sparse coupling, in numbers streamed in that time."""
 
@@ -268,6 +271,9 @@ def _batch(own, boundary, is_leaf, batch_cost):
 
     def work(s, b):
         return LEAF_COST * s * (s + LEAF_BOUNDARY * b) if is_leaf else s * (s + 2.0 * b)
+
+    if is_leaf:
+        batch_cost = LEAF_BATCH * batch_cost
 
     orders = (
         np.argsort(work(own, boundary), kind="stable"),
