@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
-from jaxcontact.linear import dissection_plan
+from jaxcontact.linear import dissection_plan, dissection_stages
 from jaxcontact.linear.nested_dissection import NestedDissection
 from jaxcontact.linear.triangular import invert_triangular
 
@@ -103,7 +103,7 @@ def error_of_step(factor, matrix, normals, seed=2):
 @pytest.fixture(autouse=True, params=[True, False], ids=["leaves", "no leaves"])
 def with_leaves(request, monkeypatch):
     """Run every test with and without the sparse coupling of the lowest fronts."""
-    monkeypatch.setattr(dissection_plan, "COUPLING_COST", -np.inf if request.param else np.inf)
+    monkeypatch.setattr(dissection_stages, "COUPLING_COST", -np.inf if request.param else np.inf)
     dissection_plan._PLANS.clear()
     return request.param
 
@@ -120,7 +120,7 @@ def test_nested_dissection_agrees_with_sparse_direct_solver(shape, block, with_p
 
 def test_nested_dissection_leaf_size_does_not_change_the_solution(monkeypatch, with_leaves):
     # Cheap launches keep more depths of the tree and more sizes apart.
-    monkeypatch.setattr(dissection_plan, "LAUNCH_COST", 1000)
+    monkeypatch.setattr(dissection_stages, "LAUNCH_COST", 1000)
     matrix, normals, coordinates = problem((11, 10), 2)
     for leaf_size in (20, 1000):
         solver = NestedDissection(leaf_size=leaf_size)

@@ -42,18 +42,6 @@ class BatchPlan(NamedTuple):
     """Position of each position in the child's boundary, (J, F, s + b); -1 if it is not there."""
 
 
-class CouplingPlan(NamedTuple):
-    """Index maps (int32) of the matrix entries that couple P positions to the other side.
-
-    The positions are those of the leaves or those of the rest, each with up to w entries.
-    """
-
-    entries: np.ndarray
-    """Place of each entry in the matrix values, (w, P); one behind them if there is none."""
-    columns: np.ndarray
-    """Position of its column, counted from the first of the other side, (w, P)."""
-
-
 class Stage(NamedTuple):
     """The fronts of one stage: sizes, batches and offsets, (F,) each; and their boundaries."""
 
@@ -155,37 +143,6 @@ def positions(stages, unknowns) -> np.ndarray:
     return position
 
 
-def couple_leaves(stages, unknowns, columns) -> tuple[CouplingPlan, CouplingPlan]:
-    """Return the matrix entries in rows of the rest and columns of the leaves, and the transpose.
-
-    Args:
-        stages: stages from the root to the lowest, the leaves.
-        unknowns: where each unknown is eliminated.
-        columns: (width, n) columns of the matrix.
-    """
-    position = positions(stages, unknowns)
-    n_rest, n_positions = stages[-2].n_positions, stages[-1].n_positions
-    is_leaf = unknowns.stage == len(stages) - 1
-
-    def coupling(is_row, first_row, n_rows, first_column):
-        width, n = columns.shape
-        is_entry = is_row & ~is_row[columns]
-        rows = np.flatnonzero(is_row)
-        count = is_entry[:, rows].sum(0)
-        slot = np.argsort(~is_entry[:, rows], axis=0, kind="stable")[: count.max(initial=1)]
-        is_filled = np.arange(len(slot))[:, None] < count
-        entries = np.full((len(slot), n_rows), width * n)
-        entries[:, position[rows] - first_row] = np.where(is_filled, slot * n + rows, width * n)
-        column = np.zeros_like(entries)
-        other = position[columns[slot, rows]] - first_column
-        column[:, position[rows] - first_row] = np.where(is_filled, other, 0)
-        return CouplingPlan(_int32(entries), _int32(column))
-
-    to_rest = coupling(~is_leaf, 0, n_rest, n_rest)
-    to_leaves = coupling(is_leaf, n_rest, n_positions - n_rest, 0)
-    return to_rest, to_leaves
-
-
 def lay_out(stages, unknowns, columns, with_leaves) -> tuple[tuple[BatchPlan, ...], ...]:
     """Return the batches of every stage, the lowest first.
 
@@ -257,9 +214,9 @@ def _stage_batches(stages, number, unknowns, position, columns, is_above_leaves)
             is_padding=is_padding,
             boundary=boundary,
             sources=sources.reshape(-1, n_fronts, s + b),
-            entries=_int32(entries),
-            child_base=_int32(child.schur[siblings]),
-            child_stride=_int32(child.b[siblings]),
+            entries=int32(entries),
+            child_base=int32(child.schur[siblings]),
+            child_stride=int32(child.b[siblings]),
             child_position=child_position,
         )
 
@@ -295,7 +252,12 @@ def _by_multiplicity(target, source, n_targets, nothing):
     return table
 
 
-def _int32(index):
+def int32(index):
+    """Return an index as int32.
+
+    Raises:
+        ValueError: if it is too large.
+    """
     if index.size and index.max() > np.iinfo(np.int32).max:
         raise ValueError(
             "the factor is too large for 32-bit indices; solve this problem by conjugate gradients"
