@@ -1,6 +1,7 @@
 """Claims about the nested-dissection factor: it agrees with a sparse direct solver on any graph."""
 
 import itertools
+from collections import OrderedDict
 from types import SimpleNamespace
 
 import jax
@@ -104,7 +105,7 @@ def error_of_step(factor, matrix, normals, seed=2):
 def with_leaves(request, monkeypatch):
     """Run every test with and without the sparse coupling of the lowest fronts."""
     monkeypatch.setattr(dissection_stages, "COUPLING_COST", -np.inf if request.param else np.inf)
-    dissection_plan._PLANS.clear()
+    monkeypatch.setattr(dissection_plan, "_PLANS", OrderedDict())
     return request.param
 
 

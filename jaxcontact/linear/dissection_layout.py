@@ -143,16 +143,16 @@ def positions(stages, unknowns) -> np.ndarray:
     return position
 
 
-def lay_out(stages, unknowns, columns, with_leaves) -> tuple[tuple[BatchPlan, ...], ...]:
+def lay_out(stages, unknowns, position, columns, with_leaves) -> tuple[tuple[BatchPlan, ...], ...]:
     """Return the batches of every stage, the lowest first.
 
     Args:
         stages: stages from the root to the lowest.
         unknowns: where each unknown is eliminated.
+        position: position of each unknown, (n,).
         columns: (width, n) columns of the matrix.
         with_leaves: whether the lowest stage are leaves.
     """
-    position = positions(stages, unknowns)
     above_leaves = len(stages) - 2 if with_leaves else -1
     batches = [
         tuple(_stage_batches(stages, number, unknowns, position, columns, number == above_leaves))

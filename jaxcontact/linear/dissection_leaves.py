@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxcontact.linear.dissection_layout import int32, positions
+from jaxcontact.linear.dissection_layout import int32
 
 
 class CouplingPlan(NamedTuple):
@@ -25,15 +25,15 @@ class CouplingPlan(NamedTuple):
     """Position of its column, counted from the first of the other side, (w, P)."""
 
 
-def couple_leaves(stages, unknowns, columns) -> tuple[CouplingPlan, CouplingPlan]:
+def couple_leaves(stages, unknowns, position, columns) -> tuple[CouplingPlan, CouplingPlan]:
     """Return the matrix entries in rows of the rest and columns of the leaves, and the transpose.
 
     Args:
         stages: stages from the root to the lowest, the leaves.
         unknowns: where each unknown is eliminated.
+        position: position of each unknown, (n,).
         columns: (width, n) columns of the matrix.
     """
-    position = positions(stages, unknowns)
     n_rest, n_positions = stages[-2].n_positions, stages[-1].n_positions
     is_leaf = unknowns.stage == len(stages) - 1
 

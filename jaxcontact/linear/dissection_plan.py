@@ -137,14 +137,14 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     position = positions(stages, where)
     unknown_of_position = np.zeros(stages[-1].n_positions, np.int32)
     unknown_of_position[position] = np.arange(n)
-    couplings = couple_leaves(stages, where, columns) if with_leaves else ()
+    couplings = couple_leaves(stages, where, position, columns) if with_leaves else ()
     n_stored = sum(int((x.s * (x.s + x.b)).sum()) for x in stages)
     if with_leaves:
         n_stored -= int((stages[-1].s * stages[-1].b).sum())
         n_stored += sum(coupling.entries.size for coupling in couplings)
     n_contact = len(unknowns)
     return DissectionPlan(
-        stages=lay_out(stages, where, columns, with_leaves),
+        stages=lay_out(stages, where, position, columns, with_leaves),
         couplings=couplings,
         unknown_of_position=unknown_of_position,
         position_of_unknown=position.astype(np.int32),
