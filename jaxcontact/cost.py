@@ -22,6 +22,7 @@ from jax.core import Tracer
 
 from jaxcontact.assembly import nodal_areas
 from jaxcontact.inner_product import nodal_norms
+from jaxcontact.precision import in_full_precision
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
 from jaxcontact.trajectory import Trajectory
@@ -70,6 +71,7 @@ class TrackingCost:
         self.control_weight = control_weight
         self.final_weight = final_weight
 
+    @in_full_precision
     def __call__(self, trajectory: Trajectory, control: Array | None = None) -> Array:
         """Return the value of the functional, a scalar.
 

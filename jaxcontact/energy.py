@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import Guess
+from jaxcontact.precision import in_full_precision
 from jaxcontact.schemes import StepState
 from jaxcontact.stepper import Stepper
 from jaxcontact.trajectory import Trajectory
@@ -58,6 +59,7 @@ class Energy:
         return self.kinetic + self.elastic
 
 
+@in_full_precision
 @jax.jit
 def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = None) -> Energy:
     """Return the energy ledger of a trajectory.

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.precision import in_full_precision
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
 
@@ -27,6 +28,7 @@ def nodal_norms(nodal_mass: SymmetricMatrix, fields: Array) -> Array:
     return jnp.sum(columns * (nodal_mass @ columns), axis=0).reshape(fields.shape[0], -1).sum(1)
 
 
+@in_full_precision
 def control_dot(system: System, dt: float | Array, first: Array, second: Array) -> Array:
     """Return the L2(0,T; L2) inner product of two controls (T, N, d), a scalar."""
     return dt * jnp.vdot(first, _from_columns(system.nodal_mass @ _as_columns(second), second))

@@ -17,10 +17,12 @@ import scipy.linalg
 import scipy.sparse.linalg
 from jax.core import Tracer
 
+from jaxcontact.precision import in_full_precision
 from jaxcontact.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.system import Basis, System
 
 
+@in_full_precision
 def reduce(system: System, modes: int, *, contact_responses: bool = True) -> System:
     """Project a system on its lowest modes and its responses to contact forces.
 

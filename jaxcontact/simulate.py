@@ -22,6 +22,7 @@ from jaxcontact.contact.branch import (
     with_weak_contact,
 )
 from jaxcontact.contact.probe import at_step
+from jaxcontact.precision import in_full_precision
 from jaxcontact.schemes import StepState
 from jaxcontact.stepper import Stepper
 from jaxcontact.system import System
@@ -113,6 +114,7 @@ def simulate_shifted(
     return _run(stepper, control, initial, weak_contact, steps, 1, None, shift)
 
 
+@in_full_precision
 @partial(jax.jit, static_argnames=("steps", "save_every", "checkpoint"))
 def _run(
     stepper: Stepper,
@@ -124,8 +126,7 @@ def _run(
     checkpoint: Checkpoint | None,
     shift: StepShift | None = None,
 ) -> Trajectory:
-    system, dt = stepper.system, stepper.dt
-    operators = stepper.operators
+    system, dt, operators = stepper.system, stepper.dt, stepper.operators
     if weak_contact is not None:
         operators = with_weak_contact(operators, weak_contact)
     start = StepState(
@@ -160,15 +161,13 @@ def _run(
             advance, start, inputs, steps, save_every, checkpoint
         )
 
-    def with_start(first: Array, rest: Array) -> Array:
-        return jnp.concatenate([first[None], rest])
-
-    displacement = with_start(start.displacement, states.displacement)
+    displacement = jnp.concatenate([start.displacement[None], states.displacement])
+    velocity = jnp.concatenate([start.velocity[None], states.velocity])
     normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
     return Trajectory(
         time=dt * jnp.arange(0, steps + 1, save_every),
         displacement=system.lift(displacement),
-        velocity=system.lift(with_start(start.velocity, states.velocity)),
+        velocity=system.lift(velocity),
         gap=system.gap[None, :] - normal_displacement,
         contact_impulse=impulse,
         active=active,

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse
 from jax import Array
 
+from jaxcontact.precision import in_full_precision
 from jaxcontact.symmetric_product import symmetric_product, take
 
 __all__ = ["ComponentwiseMatrix", "ContactNormals", "SymmetricMatrix", "take", "unknown_columns"]
@@ -52,6 +53,7 @@ class SymmetricMatrix:
         """Number of rows, n."""
         return self.values.shape[-1]
 
+    @in_full_precision
     def __matmul__(self, x: Array) -> Array:
         """Return the product with a vector (n,) or with the columns of a matrix (n, r)."""
         if self.columns is None:

@@ -17,6 +17,7 @@ from jax.core import Tracer
 
 from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton, Solution, Status
 from jaxcontact.linear import LinearSolver, check_memory, choose_linear_solver
+from jaxcontact.precision import in_full_precision
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.simulate import SolveError
 from jaxcontact.stepper import unknown_coordinates
@@ -47,6 +48,7 @@ class StaticContact:
     """A `Status`, int32."""
 
 
+@in_full_precision
 def solve_static(
     system: System,
     *,

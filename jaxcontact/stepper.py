@@ -14,6 +14,7 @@ from jax.core import Tracer
 from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton
 from jaxcontact.linear import LinearSolver, check_memory, choose_linear_solver
 from jaxcontact.linear.nested_dissection import DissectionFactor
+from jaxcontact.precision import in_full_precision
 from jaxcontact.schemes import ContactImplicit, Scheme
 from jaxcontact.sparse import SymmetricMatrix
 from jaxcontact.system import System
@@ -59,6 +60,7 @@ EXAMPLES = {
 }
 
 
+@in_full_precision
 def prepare(
     system: System,
     dt: float | Array,

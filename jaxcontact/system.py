@@ -19,6 +19,7 @@ from jax import Array
 from jaxcontact import assembly
 from jaxcontact.material import KelvinVoigt
 from jaxcontact.obstacle import gap_and_normals
+from jaxcontact.precision import in_full_precision
 from jaxcontact.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
@@ -110,6 +111,7 @@ class System:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
         return _lift(self, x)
 
+    @in_full_precision
     def restrict(self, y: Array) -> Array:
         """Return the unknowns (..., n) of a nodal field (..., N, d).
 
@@ -118,12 +120,14 @@ class System:
         free = _free_components(self, y)
         return free if self.basis is None else free @ self.basis.projector
 
+    @in_full_precision
     def control_load(self, control: Array) -> Array:
         """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
         load = _free_components(self, self.nodal_mass @ control)
         return load if self.basis is None else load @ self.basis.vectors
 
 
+@in_full_precision
 def discretize(scene: Scene, dtype=jnp.float64) -> System:
     """Assemble the P1 system of a scene.
 
@@ -260,8 +264,7 @@ def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Arra
     for name in sorted(scene.contact):
         sets.setdefault(id(scene.contact[name]), []).append(name)
     for names in sets.values():
-        facets = np.concatenate([scene.mesh.facets[name] for name in names])
-        facets = np.unique(facets, axis=0)
+        facets = np.unique(np.concatenate([scene.mesh.facets[name] for name in names]), axis=0)
         set_nodes = np.unique(facets)
         gap, vectors = gap_and_normals(scene.contact[names[0]], points[set_nodes])
         nodes.append(set_nodes)
@@ -285,6 +288,7 @@ def _free_components(system: System, y: Array) -> Array:
     return y.reshape(*y.shape[:-2], -1)
 
 
+@in_full_precision
 def _lift(system: System, x: Array) -> Array:
     if system.basis is not None:
         x = x @ system.basis.vectors.T

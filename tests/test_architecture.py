@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1] / "jaxcontact"
 
 # Bottom first. A file imports from layers below its own, or from its own folder.
 LAYERS = (
-    {"symmetric_product"},
+    {"precision", "symmetric_product"},
     {"sparse"},
     {"mesh", "material", "obstacle", "reference"},
     {"meshes", "io", "scene"},

@@ -26,6 +26,7 @@ from jaxcontact.contact.complementarity import Solution
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.tangent import instantiate, linear_contact, solve_forward
 from jaxcontact.contact.weak import Strong
+from jaxcontact.precision import in_full_precision
 from jaxcontact.symmetric_product import outer_on_pattern
 
 
@@ -91,6 +92,7 @@ def _solve_fwd(*arguments):
     return (w, solution), residuals
 
 
+@in_full_precision
 def _solve_bwd(residuals, cotangents):
     w_bar, solution_bar = cotangents
     pairs, softness, velocity, multiplier, values, weights, fixed = residuals

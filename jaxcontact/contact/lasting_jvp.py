@@ -20,6 +20,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jaxcontact.precision import in_full_precision
+
 _lasting = Primitive("lasting_jvp")
 _lasting.multiple_results = True
 
@@ -36,6 +38,8 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
     Returns:
         A function with the same result. Derivative: by the rule, in any order of transformations.
     """
+    # Both are traced again when the primitive is lowered or differentiated.
+    function, rule = in_full_precision(function), in_full_precision(rule)
 
     def call(*arguments: Any) -> Any:
         leaves, tree = jax.tree.flatten(arguments)

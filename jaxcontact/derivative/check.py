@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from jaxcontact.precision import in_full_precision
 from jaxcontact.trajectory import Trajectory
 
 #: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
@@ -113,6 +114,7 @@ class GradientCheck:
         return f"{self.central_relative_error[i]:.1e} relative"
 
 
+@in_full_precision
 @np.errstate(invalid="ignore", over="ignore")  # a NaN is a finding, not a warning
 def check_gradient(
     objective: Callable[[Any], Array],

@@ -22,11 +22,13 @@ from jax.core import Tracer
 
 from jaxcontact.contact import CriticalCone
 from jaxcontact.contact.branch import tangent_of
+from jaxcontact.precision import in_full_precision
 from jaxcontact.simulate import raise_if_failed, simulate
 from jaxcontact.stepper import Stepper
 from jaxcontact.trajectory import State, Trajectory
 
 
+@in_full_precision
 def directional_derivative(
     stepper: Stepper,
     control: Array | None,

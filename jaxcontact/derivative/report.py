@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.contact import Inactive, Status, Strong
+from jaxcontact.precision import in_full_precision
 from jaxcontact.simulate import StepShift, raise_if_failed, simulate, simulate_shifted
 from jaxcontact.stepper import Stepper
 from jaxcontact.trajectory import State, Trajectory
@@ -104,6 +105,7 @@ class DerivativeReport:
         return "\n".join(lines)
 
 
+@in_full_precision
 def derivative_report(
     stepper: Stepper,
     control: Array | None,

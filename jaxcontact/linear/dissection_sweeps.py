@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.precision import in_full_precision
 from jaxcontact.sparse import take
 from jaxcontact.symmetric_product import materialize
 
@@ -56,6 +57,7 @@ class Partial(NamedTuple):
 
 def with_trailing_axis(sweep):
     """Let vmap over the operands (not over the factor) append to the trailing axis."""
+    sweep = in_full_precision(sweep)  # traced again under vmap
     batched = jax.custom_batching.custom_vmap(sweep)
 
     @batched.def_vmap

@@ -20,6 +20,7 @@ from jaxcontact.optimize.driver import check_method, choose_product, make_bounds
 from jaxcontact.optimize.inner_products import InnerProduct
 from jaxcontact.optimize.lbfgs import LBFGS
 from jaxcontact.optimize.problem import Point, identity, select, value_and_gradient
+from jaxcontact.precision import in_full_precision
 from jaxcontact.system import System
 
 
@@ -85,6 +86,7 @@ class TracedProblem(NamedTuple):
         return jnp.sqrt(self.dot(step, step))
 
 
+@in_full_precision
 def descend(
     objective: Callable[[Array], Array],
     u0: Array,

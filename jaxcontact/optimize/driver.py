@@ -19,6 +19,7 @@ from jaxcontact.optimize.lbfgs import LBFGS
 from jaxcontact.optimize.problem import Point, Problem
 from jaxcontact.optimize.progress import progress_bar
 from jaxcontact.optimize.result import History, Result, rebuild_state
+from jaxcontact.precision import in_full_precision
 from jaxcontact.system import System
 
 
@@ -38,6 +39,7 @@ class Method(Protocol):
         ...
 
 
+@in_full_precision
 def optimize(
     objective: Callable[[Array], Array],
     u0: Array | Result,

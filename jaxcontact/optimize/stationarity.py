@@ -12,10 +12,12 @@ from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.optimize.driver import state_problem
 from jaxcontact.optimize.inner_products import InnerProduct
 from jaxcontact.optimize.problem import as_partial
+from jaxcontact.precision import in_full_precision
 from jaxcontact.system import System
 from jaxcontact.trajectory import Trajectory
 
 
+@in_full_precision
 def stationarity(
     objective: Callable[[Array], Array],
     u: Array,
