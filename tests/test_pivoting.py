@@ -78,6 +78,33 @@ def test_one_pair_more_is_an_exchange_and_many_are_a_factorisation():
     assert pivot(one, W, pairs_of(0b1111111)).exchanges == 0
 
 
+@pytest.mark.parametrize("n_due", [0, 1, 5, 20])
+@pytest.mark.parametrize("own_compliance", [False, True])
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_a_batch_is_what_each_of_its_scenes_is(n_due, own_compliance, is_nested):
+    n = 20
+    W = jnp.stack([compliance_of(seed if own_compliance else 0) for seed in range(n)])
+    start = jax.lax.map(lambda w: pivoting.pivot(pivoting.unpivoted(w), w, pairs_of(0b1)), W)
+    due = np.random.default_rng(0).permutation(n) < n_due
+    far, near = pairs_of(0b1101001), pairs_of(0b1001)
+    pairs = jnp.stack([far if is_far else near for is_far in due])
+    expected = jax.lax.map(lambda x: pivoting.pivot(*x), (start, W, pairs))
+
+    batched, axes = pivoting.pivot, (0, 0 if own_compliance else None, 0)
+    if is_nested:
+        start, pairs = jax.tree.map(lambda x: x.reshape(4, 5, *x.shape[1:]), (start, pairs))
+        W = W.reshape(4, 5, *W.shape[1:])
+        batched = jax.vmap(batched, in_axes=axes)
+    W = W if own_compliance else compliance_of(0)
+    result = jax.jit(jax.vmap(batched, in_axes=axes))(start, W, pairs)
+    result = jax.tree.map(lambda x, like: x.reshape(like.shape), result, expected)
+    assert np.sum(expected.exchanges == 0) == n_due
+    np.testing.assert_array_equal(result.exchanges, expected.exchanges)
+    np.testing.assert_array_equal(result.pairs, expected.pairs)
+    scale = np.abs(expected.matrix).max(axis=(1, 2), keepdims=True)
+    assert np.max(np.abs(result.matrix - expected.matrix) / scale) < 1e-14
+
+
 def test_a_worn_transform_is_noticed_and_made_anew():
     W = compliance_of(0)
     pairs = pairs_of(0b1011)

@@ -31,6 +31,9 @@ from jaxcontact.linear.triangular import invert_triangular
 #: matrix once, a factorisation costs about as much as C / 8 of them.
 PAIRS_PER_EXCHANGE = 8
 
+#: In a batch of scenes the transforms that are due are made by an eighth of the batch at a time.
+PARTS_OF_A_BATCH = 8
+
 #: Number of exchanges that marks a transform as worn: the next one is made anew.
 WORN = 2**30
 
@@ -58,13 +61,7 @@ def pivot(pivoted: PivotedCompliance, compliance: Array, pairs: Array) -> Pivote
     n_changes = jnp.sum(pivoted.pairs != pairs)
     is_far = PAIRS_PER_EXCHANGE * (n_changes - 1) > pairs.shape[0]
 
-    # A loop of at most one turn: vmap evaluates both branches of a cond, but it can skip a loop.
-    def make_anew(carry: tuple[PivotedCompliance, Array]) -> tuple[PivotedCompliance, Array]:
-        fresh = PivotedCompliance(_transform(compliance, pairs), pairs, jnp.int32(0))
-        return fresh, jnp.bool_(False)
-
-    start = (pivoted, (pivoted.exchanges >= WORN) | is_far)
-    pivoted, _ = jax.lax.while_loop(lambda carry: carry[1], make_anew, start)
+    pivoted = _renew(pivoted, compliance, pairs, (pivoted.exchanges >= WORN) | is_far)
 
     def differs(pivoted: PivotedCompliance) -> Array:
         return jnp.any(pivoted.pairs != pairs)
@@ -100,6 +97,52 @@ def solve(
     is_fine = jnp.max(jnp.abs(error)) <= 0.1 * jnp.finfo(p.dtype).eps ** 0.5 * size
     exchanges = jnp.where(~is_fine & (pivoted.exchanges > 0), WORN, pivoted.exchanges)
     return p + on_set(error), pivoted._replace(exchanges=exchanges)
+
+
+@jax.custom_batching.custom_vmap
+def _renew(
+    pivoted: PivotedCompliance, compliance: Array, pairs: Array, is_due: Array
+) -> PivotedCompliance:
+    """Make S anew if it is due."""
+
+    def make_anew() -> PivotedCompliance:
+        return PivotedCompliance(_transform(compliance, pairs), pairs, jnp.int32(0))
+
+    return jax.lax.cond(is_due, make_anew, lambda: pivoted)
+
+
+@_renew.def_vmap
+def _renew_in_parts(size, is_batched, pivoted, compliance, pairs, is_due):
+    """Make those of a batch anew that are due: seldom all of them in one step."""
+    at_once = -(-size // PARTS_OF_A_BATCH)
+    is_compliance_batched = is_batched[1]
+
+    def for_all(x: Array, is_batched: bool) -> Array:
+        return x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+
+    pivoted, pairs, is_due = jax.tree.map(
+        for_all, (pivoted, pairs, is_due), (is_batched[0], *is_batched[2:])
+    )
+
+    def is_any_due(carry: tuple[Array, Array]) -> Array:
+        return jnp.any(carry[1])
+
+    def make_some(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        matrices, is_due = carry
+        (some,) = jnp.nonzero(is_due, size=at_once, fill_value=size)
+        own = compliance.at[some].get(mode="clip") if is_compliance_batched else compliance
+        transform = jax.vmap(_transform, in_axes=(0 if is_compliance_batched else None, 0))
+        made = transform(own, pairs.at[some].get(mode="clip"))
+        matrices = matrices.at[some].set(made, mode="drop")
+        return matrices, is_due.at[some].set(False, mode="drop")
+
+    matrices, _ = jax.lax.while_loop(is_any_due, make_some, (pivoted.matrix, is_due))
+    renewed = PivotedCompliance(
+        matrices,
+        jnp.where(is_due[:, None], pairs, pivoted.pairs),
+        jnp.where(is_due, 0, pivoted.exchanges),
+    )
+    return renewed, jax.tree.map(lambda _: True, renewed)
 
 
 def _transform(compliance: Array, pairs: Array) -> Array:
