@@ -4,17 +4,19 @@ Times a full contact step (forward, inside one compiled scan) against the number
 the motion recorded after every step and with the last state alone (`save_every`). The
 limit is the time to read the nonzeros of the Cholesky factor twice, once for the sweep up and once
 for the sweep down, without padding: two dot products of a buffer of that size, in turns with the
-steps of the same run. Conjugate gradients have no factor and no limit. The peak memory is that of
-the process so far: start anew for every figure that is to be quoted.
+steps of the same run and on the same device. Conjugate gradients have no factor and no limit. The
+peak memory is that of the process so far: start anew for every figure that is to be quoted.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import measure
 import numpy as np
 import speed_scenes
@@ -43,6 +45,26 @@ def factor_entries(body: speed_scenes.Body) -> int:
     return plan.n_factor_entries
 
 
+def reader(entries: int, times: int, dtype: Any) -> Callable[[], Any]:
+    """Return a function that reads so many numbers so many times, by dot products."""
+    if jax.default_backend() == "cpu":
+        buffer = np.ones(entries, dtype)
+
+        def stream() -> None:
+            for _ in range(times):
+                np.dot(buffer, buffer)
+
+        return stream
+
+    numbers = jnp.ones(entries, dtype)
+
+    def read_once(_: int, total: jax.Array) -> jax.Array:
+        return total + jnp.sum(numbers * (numbers + total))  # total: or else it is read once only
+
+    read = jax.jit(lambda: jax.lax.fori_loop(0, times, read_once, jnp.zeros((), dtype)))
+    return lambda: jax.block_until_ready(read())
+
+
 def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeats: int) -> dict:
     """Return one row: a body of a shape with about n unknowns."""
     body = speed_scenes.SHAPES[shape](n, dtype)
@@ -63,12 +85,7 @@ def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeat
     bare, _ = measure.compiled(run_bare, stepper, body.initial)
     contact = speed_scenes.check(program(stepper, body.initial))
     entries = factor_entries(body) if solver != "cg" else 0
-    buffer = np.ones(entries, dtype)
-
-    def stream() -> None:
-        for _ in range(2 * steps):
-            np.dot(buffer, buffer)
-
+    stream = reader(entries, 2 * steps, dtype)
     runs = {
         "step": lambda: program(stepper, body.initial),
         "bare": lambda: bare(stepper, body.initial),

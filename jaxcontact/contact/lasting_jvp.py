@@ -39,7 +39,7 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
         A function with the same result. Derivative: by the rule, in any order of transformations.
     """
     # Both are traced again when the primitive is lowered or differentiated.
-    function, rule = in_full_precision(function), in_full_precision(rule)
+    function, rule = jax.jit(in_full_precision(function)), in_full_precision(rule)
 
     def call(*arguments: Any) -> Any:
         leaves, tree = jax.tree.flatten(arguments)

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.linear.triangular import invert_triangular
+from jaxcontact.precision import in_full_precision
 
 #: A set that differs in more than C / 8 pairs is factorised anew: an exchange reads and writes the
 #: matrix once, a factorisation costs about as much as C / 8 of them.
@@ -112,6 +113,7 @@ def _renew(
 
 
 @_renew.def_vmap
+@in_full_precision
 def _renew_in_parts(size, is_batched, pivoted, compliance, pairs, is_due):
     """Make those of a batch anew that are due: seldom all of them in one step."""
     at_once = -(-size // PARTS_OF_A_BATCH)

@@ -80,7 +80,7 @@ def with_trailing_axis(sweep):
         result = batched(factor, *jax.tree.map(append, operands, tuple(is_batched[1:])))
         return jax.tree.map(split, result), jax.tree.map(lambda _: True, result)
 
-    return batched
+    return jax.jit(batched)
 
 
 def _sum_sources(update, sources):
