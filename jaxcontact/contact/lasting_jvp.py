@@ -38,7 +38,8 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
     Returns:
         A function with the same result. Derivative: by the rule, in any order of transformations.
     """
-    # Both are traced again when the primitive is lowered or differentiated.
+    # Marked, since both are traced outside of `call` when the primitive is lowered or
+    # differentiated; under jit the function is then traced only once.
     function, rule = jax.jit(in_full_precision(function)), in_full_precision(rule)
 
     def call(*arguments: Any) -> Any:

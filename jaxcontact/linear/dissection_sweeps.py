@@ -56,7 +56,10 @@ class Partial(NamedTuple):
 
 
 def with_trailing_axis(sweep):
-    """Let vmap over the operands (not over the factor) append to the trailing axis."""
+    """Let vmap over the operands (not over the factor) append to the trailing axis.
+
+    The sweep is under jit, so that the forward and the backward pass trace it once.
+    """
     sweep = in_full_precision(sweep)  # traced again under vmap
     batched = jax.custom_batching.custom_vmap(sweep)
 
