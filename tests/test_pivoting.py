@@ -78,9 +78,8 @@ def test_one_pair_more_is_an_exchange_and_many_are_a_factorisation():
     assert pivot(one, W, pairs_of(0b1111111)).exchanges == 0
 
 
-@pytest.mark.parametrize("n_due", [0, 1, 5, 20])
+@pytest.mark.parametrize(("n_due", "is_nested"), [(0, False), (1, False), (20, False), (5, True)])
 @pytest.mark.parametrize("own_compliance", [False, True])
-@pytest.mark.parametrize("is_nested", [False, True])
 def test_a_batch_is_what_each_of_its_scenes_is(n_due, own_compliance, is_nested):
     n = 20
     W = jnp.stack([compliance_of(seed if own_compliance else 0) for seed in range(n)])
