@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,14 @@ def reader(entries: int, times: int, dtype: Any) -> Callable[[], Any]:
 
         return stream
 
-    numbers = jnp.ones(entries, dtype)
+    @jax.jit
+    def read(numbers: jax.Array) -> jax.Array:
+        def read_once(_: int, total: jax.Array) -> jax.Array:
+            return total + jnp.sum(numbers * (numbers + total))  # without total only read once
 
-    def read_once(_: int, total: jax.Array) -> jax.Array:
-        return total + jnp.sum(numbers * (numbers + total))  # total: or else it is read once only
+        return jax.lax.fori_loop(0, times, read_once, jnp.zeros((), dtype))
 
-    read = jax.jit(lambda: jax.lax.fori_loop(0, times, read_once, jnp.zeros((), dtype)))
-    return lambda: jax.block_until_ready(read())
+    return partial(read, jnp.ones(entries, dtype))
 
 
 def measure_step(shape: str, n: int, solver: str, steps: int, dtype: Any, repeats: int) -> dict:

@@ -10,6 +10,14 @@ VISCOUS = jc.KelvinVoigt(young=100.0, poisson=0.3, bulk_viscosity=0.2, shear_vis
 BLOCK = jc.meshes.rectangle((2.0, 1.0), h=0.5)
 #: The wave needs 0.1 s through the block, the fall through the gap 0.14 s: contact after 7 steps.
 DT = 0.02
+#: Every time-stepping scheme, the default first.
+SCHEMES = [
+    jc.ContactImplicit(),
+    jc.ContactStabilized(),
+    jc.RedistributedMass(),
+    jc.BackwardEuler(),
+    jc.Trapezoidal(),
+]
 
 
 def block_scene(material=VISCOUS, *, gap=0.1, normal=(0.0, 1.0), force=(0.0, -10.0), mesh=BLOCK):

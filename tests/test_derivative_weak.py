@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import SCHEMES
 from thrown_bodies import DT, STEPS, cost, grazing, parameters, stepper_of
 
 import jaxcontact as jc
@@ -13,13 +14,6 @@ FIRST_ORDER = 1.0
 #: Two ways to add the same numbers.
 ROUNDING = 1e-10
 DIMENSIONS = [1, 2, 3]
-SCHEMES = [
-    jc.ContactImplicit(),
-    jc.ContactStabilized(),
-    jc.RedistributedMass(),
-    jc.BackwardEuler(),
-    jc.Trapezoidal(),
-]
 FIELDS = ("displacement", "velocity", "gap", "contact_impulse")
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import SCHEMES
 
 import jaxcontact as jc
 from jaxcontact.linear.nested_dissection import NestedDissection
@@ -28,11 +29,11 @@ def coarse_products(function, *arguments):
     return len(products), [line for line in products if "HIGHEST, HIGHEST" not in line]
 
 
-def block(young=1.0, dtype=jnp.float32):
+def block(young=1.0):
     mesh = jc.meshes.rectangle((1.0, 1.0), h=0.125)
     material = jc.KelvinVoigt(young=young, poisson=0.3, bulk_viscosity=0.01, shear_viscosity=0.01)
     floor = jc.HalfSpace(np.array([0.0, -0.01]), np.array([0.0, 1.0]))
-    return jc.discretize(jc.Scene(mesh, material, contact={"bottom": floor}), dtype=dtype)
+    return jc.discretize(jc.Scene(mesh, material, contact={"bottom": floor}), dtype=jnp.float32)
 
 
 def throw(stepper, control, **options):
@@ -63,15 +64,6 @@ def test_material_gradient_is_in_full_precision(control, solver):
         count, coarse = coarse_products(program, young, control)
         assert count > 5
         assert not coarse
-
-
-SCHEMES = [
-    jc.ContactImplicit(),
-    jc.ContactStabilized(),
-    jc.RedistributedMass(),
-    jc.BackwardEuler(),
-    jc.Trapezoidal(),
-]
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: type(scheme).__name__)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import SCHEMES
 
 import jaxcontact as jc
 
@@ -16,13 +17,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import bars
 
-SCHEMES = [
-    jc.ContactImplicit(),
-    jc.ContactStabilized(),
-    jc.RedistributedMass(),
-    jc.BackwardEuler(),
-    jc.Trapezoidal(),
-]
 by_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
 STEPS = 40
 

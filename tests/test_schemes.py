@@ -8,17 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bodies import SCHEMES
 
 import jaxcontact as jc
 from jaxcontact.schemes.mass_redistribution import redistribute
 
-SCHEMES = [
-    jc.ContactImplicit(),
-    jc.ContactStabilized(),
-    jc.RedistributedMass(),
-    jc.BackwardEuler(),
-    jc.Trapezoidal(),
-]
 by_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
 STEPS = 25
 SLANTED = (0.3, 1.0)

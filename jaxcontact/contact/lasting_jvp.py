@@ -39,7 +39,7 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
         A function with the same result. Derivative: by the rule, in any order of transformations.
     """
     # Marked, since both are traced outside of `call` when the primitive is lowered or
-    # differentiated; under jit the function is then traced only once.
+    # differentiated; under jit the function is not traced anew each time.
     function, rule = jax.jit(in_full_precision(function)), in_full_precision(rule)
 
     def call(*arguments: Any) -> Any:

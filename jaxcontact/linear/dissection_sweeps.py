@@ -58,7 +58,7 @@ class Partial(NamedTuple):
 def with_trailing_axis(sweep):
     """Let vmap over the operands (not over the factor) append to the trailing axis.
 
-    The sweep is under jit, so that the forward and the backward pass trace it once.
+    The sweep is under jit, so that it is not traced anew at every call.
     """
     sweep = in_full_precision(sweep)  # traced again under vmap
     batched = jax.custom_batching.custom_vmap(sweep)
