@@ -14,16 +14,15 @@ import sys
 import tempfile
 from pathlib import Path
 
-import bars
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
+from common import bars, measure
 
 import jaxcontact as jc
 
 SCHEMES = {"ContactImplicit": jc.ContactImplicit(), "Trapezoidal": jc.Trapezoidal()}
-PROGRAM = Path(__file__).with_name("getfem_bar.py")
+PROGRAM = Path(__file__).parent / "common" / "getfem_bar.py"
 
 
 def find_python() -> str | None:

@@ -11,8 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import measure
-import speed_scenes
+from common import measure, speed_scenes
 
 import jaxcontact as jc
 

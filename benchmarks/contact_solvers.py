@@ -14,9 +14,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
-import speed_scenes
+from common import measure, speed_scenes
 from jax import Array
 
 import jaxcontact as jc

@@ -13,12 +13,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import alternatives
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
-import speed_scenes
+from common import alternatives, measure, speed_scenes
 from jax import Array
 
 import jaxcontact as jc

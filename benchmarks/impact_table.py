@@ -8,9 +8,8 @@ force is in the JSON. The chart shows the contact force of one impact.
 
 from __future__ import annotations
 
-import bars
-import measure
 import numpy as np
+from common import bars, measure
 
 import jaxcontact as jc
 

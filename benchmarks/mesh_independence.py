@@ -13,8 +13,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
+from common import measure
 
 import jaxcontact as jc
 from jaxcontact.optimize import LBFGS

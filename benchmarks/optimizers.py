@@ -17,9 +17,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
 import optax
+from common import measure
 
 import jaxcontact as jc
 from jaxcontact.optimize import LBFGS, NewtonCG

@@ -8,9 +8,8 @@ contact, where the exact force of the elastic bar is constant, over that force; 
 
 from __future__ import annotations
 
-import bars
-import measure
 import numpy as np
+from common import bars, measure
 
 import jaxcontact as jc
 

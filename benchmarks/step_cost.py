@@ -18,14 +18,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
-import speed_scenes
+from common import measure, speed_scenes
 
 import jaxcontact as jc
-from jaxcontact.linear import dissection_plan
-from jaxcontact.linear.nested_dissection import NestedDissection
-from jaxcontact.sparse import unknown_columns
+from jaxcontact.linear.dissection import plan as dissection_plan
+from jaxcontact.linear.dissection.nested_dissection import NestedDissection
+from jaxcontact.system.sparse import unknown_columns
 
 SIZES_2D = [500, 2_000, 10_000, 50_000, 200_000]
 SIZES_3D = [3_000, 20_000, 80_000]

@@ -12,12 +12,10 @@ import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
-import bars
-import half_disc_runs
 import jax
 import jax.numpy as jnp
-import measure
 import numpy as np
+from common import bars, half_disc_runs, measure
 
 import jaxcontact as jc
 

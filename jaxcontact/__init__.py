@@ -4,7 +4,11 @@ Shape comments use one letter per axis: N nodes, E or e cells, a b local nodes o
 space dimension, i j components, n unknowns, C contact pairs, T time steps.
 """
 
-from jaxcontact import meshes, reference, scenes
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from jaxcontact import reference
 from jaxcontact.contact import (
     AlongDirection,
     CriticalCone,
@@ -16,7 +20,9 @@ from jaxcontact.contact import (
     Strong,
     with_contact,
 )
-from jaxcontact.cost import TrackingCost, contact_force, contact_force_error, contact_time
+from jaxcontact.control import scenes
+from jaxcontact.control.cost import TrackingCost, contact_force, contact_force_error, contact_time
+from jaxcontact.control.inner_product import l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
@@ -24,14 +30,15 @@ from jaxcontact.derivative import (
     derivative_report,
     directional_derivative,
 )
-from jaxcontact.energy import Energy, energy
-from jaxcontact.inner_product import l2_value_and_grad
-from jaxcontact.io import read_mesh
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
-from jaxcontact.material import KelvinVoigt
-from jaxcontact.memory import MemoryEstimate, estimate_memory
-from jaxcontact.mesh import Mesh
-from jaxcontact.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.motion.checks import SolveError
+from jaxcontact.motion.energy import Energy, energy
+from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
+from jaxcontact.motion.pressure import contact_pressure
+from jaxcontact.motion.simulate import simulate
+from jaxcontact.motion.static import StaticContact, solve_static
+from jaxcontact.motion.stepper import Stepper, prepare
+from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.optimize import (
     LBFGS,
     Actuator,
@@ -51,9 +58,12 @@ from jaxcontact.optimize import (
     optimize,
     stationarity,
 )
-from jaxcontact.pressure import contact_pressure
-from jaxcontact.reduction import reduce
-from jaxcontact.scene import Scene
+from jaxcontact.scene import meshes
+from jaxcontact.scene.io import read_mesh
+from jaxcontact.scene.material import KelvinVoigt
+from jaxcontact.scene.mesh import Mesh
+from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.scene.scene import Scene
 from jaxcontact.schemes import (
     BackwardEuler,
     ContactImplicit,
@@ -61,12 +71,12 @@ from jaxcontact.schemes import (
     RedistributedMass,
     Trapezoidal,
 )
-from jaxcontact.simulate import SolveError, simulate
-from jaxcontact.static import StaticContact, solve_static
-from jaxcontact.stepper import Stepper, prepare
-from jaxcontact.system import System, discretize
-from jaxcontact.time_loop import Checkpoint
-from jaxcontact.trajectory import State, Trajectory
+from jaxcontact.system.reduction import reduce
+from jaxcontact.system.system import System, discretize
+from jaxcontact.transforms.time_loop import Checkpoint
+
+if TYPE_CHECKING:
+    from jaxcontact.output import export, plot
 
 __all__ = [
     "LBFGS",
@@ -127,10 +137,12 @@ __all__ = [
     "discretize",
     "energy",
     "estimate_memory",
+    "export",
     "l2_value_and_grad",
     "load_result",
     "meshes",
     "optimize",
+    "plot",
     "prepare",
     "read_mesh",
     "reduce",
@@ -141,3 +153,13 @@ __all__ = [
     "stationarity",
     "with_contact",
 ]
+
+#: Loaded when they are asked for: a simulation needs no pictures and no files.
+_LAZY = {"plot": "jaxcontact.output.plot", "export": "jaxcontact.output.export"}
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Load `jc.plot` and `jc.export` on first use."""
+    if name in _LAZY:
+        return importlib.import_module(_LAZY[name])
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

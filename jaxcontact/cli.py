@@ -27,10 +27,10 @@ import optax
 from jax import Array
 
 import jaxcontact as jc
-from jaxcontact.export import write_time_series
-from jaxcontact.figures import draw_figures
-from jaxcontact.inner_product import control_dot
+from jaxcontact.control.inner_product import control_dot
 from jaxcontact.optimize import LBFGS, NewtonCG, Optax, SteepestDescent
+from jaxcontact.output.export import write_time_series
+from jaxcontact.output.figures import draw_figures
 
 #: Time levels in a time series; longer motions are thinned out to about as many.
 MAX_LEVELS = 150

@@ -26,8 +26,8 @@ from jaxcontact.contact.complementarity import Solution
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.tangent import instantiate, linear_contact, solve_forward
 from jaxcontact.contact.weak import Strong
-from jaxcontact.precision import in_full_precision
-from jaxcontact.symmetric_product import outer_on_pattern
+from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.symmetric_product import outer_on_pattern
 
 
 class Residuals(NamedTuple):

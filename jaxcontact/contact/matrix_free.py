@@ -17,7 +17,7 @@ from jaxcontact.contact.complementarity import (
     Status,
 )
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
-from jaxcontact.sparse import ContactNormals
+from jaxcontact.system.sparse import ContactNormals
 
 
 def solve_contact(

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.linear.triangular import invert_triangular
-from jaxcontact.precision import in_full_precision
+from jaxcontact.transforms.precision import in_full_precision
 
 #: A set that differs in more than C / 8 pairs is factorised anew: an exchange reads and writes the
 #: matrix once, a factorisation costs about as much as C / 8 of them.

@@ -18,7 +18,7 @@ from jax import Array
 from jaxcontact.contact.complementarity import ContactSolver, Guess, solve_on_set
 from jaxcontact.linear import Factor
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
 class Fixed(NamedTuple):

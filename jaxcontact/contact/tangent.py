@@ -20,12 +20,12 @@ from jax.custom_derivatives import SymbolicZero
 
 from jaxcontact.contact import critical_cone, matrix_free
 from jaxcontact.contact.complementarity import ContactSolver, Solution
-from jaxcontact.contact.forward_only import forward_only
-from jaxcontact.contact.lasting_jvp import lasting_jvp
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.weak import CriticalCone, OnBranch, WeakContact
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.transforms.forward_only import forward_only
+from jaxcontact.transforms.lasting_jvp import lasting_jvp
 
 
 def _solve_forward(

@@ -30,7 +30,7 @@ from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
 from jaxcontact.linear.conjugate_gradient import IterativeFactor
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
 @jax.tree_util.register_dataclass

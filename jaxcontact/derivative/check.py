@@ -20,8 +20,8 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from jaxcontact.precision import in_full_precision
-from jaxcontact.trajectory import Trajectory
+from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.transforms.precision import in_full_precision
 
 #: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
 NOISE = 64.0

@@ -22,10 +22,11 @@ from jax.core import Tracer
 
 from jaxcontact.contact import CriticalCone
 from jaxcontact.contact.branch import tangent_of
-from jaxcontact.precision import in_full_precision
-from jaxcontact.simulate import raise_if_failed, simulate
-from jaxcontact.stepper import Stepper
-from jaxcontact.trajectory import State, Trajectory
+from jaxcontact.motion.checks import raise_if_failed
+from jaxcontact.motion.simulate import simulate
+from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.trajectory import State, Trajectory
+from jaxcontact.transforms.precision import in_full_precision
 
 
 @in_full_precision

@@ -22,10 +22,11 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.contact import Inactive, Status, Strong
-from jaxcontact.precision import in_full_precision
-from jaxcontact.simulate import StepShift, raise_if_failed, simulate, simulate_shifted
-from jaxcontact.stepper import Stepper
-from jaxcontact.trajectory import State, Trajectory
+from jaxcontact.motion.checks import raise_if_failed
+from jaxcontact.motion.simulate import StepShift, simulate, simulate_shifted
+from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.trajectory import State, Trajectory
+from jaxcontact.transforms.precision import in_full_precision
 
 #: A duality gap beyond rounding, also in float32 over many steps.
 MODES_DIFFER = 1e-3

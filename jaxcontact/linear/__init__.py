@@ -7,8 +7,8 @@ of the matrix D: solve with it, and solve a contact problem on it in one sweep (
 from jaxcontact.linear.choice import check_memory, choose_linear_solver
 from jaxcontact.linear.conjugate_gradient import ConjugateGradient
 from jaxcontact.linear.dense import Dense
+from jaxcontact.linear.dissection.nested_dissection import NestedDissection
 from jaxcontact.linear.interface import Factor, LinearSolver
-from jaxcontact.linear.nested_dissection import NestedDissection
 
 __all__ = [
     "ConjugateGradient",

@@ -15,8 +15,8 @@ import jax
 
 from jaxcontact.linear.conjugate_gradient import ConjugateGradient
 from jaxcontact.linear.dense import Dense
+from jaxcontact.linear.dissection.nested_dissection import NestedDissection
 from jaxcontact.linear.interface import LinearSolver
-from jaxcontact.linear.nested_dissection import NestedDissection
 
 #: Largest number of unknowns that are solved by the dense inverse.
 DENSE_LIMIT = 150

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
 @jax.tree_util.register_dataclass

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from jax import Array
 
-from jaxcontact.sparse import ContactNormals, SymmetricMatrix
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
 class Factor(Protocol):

@@ -1,7 +1,7 @@
 """Optimisation in the inner product of the controls: methods, bounds, parametrised controls."""
 
+from jaxcontact.control.actuators import Actuator, actuator, boundary_actuator
 from jaxcontact.optimize.certificate import Stationarity
-from jaxcontact.optimize.controls import Actuator, actuator, boundary_actuator
 from jaxcontact.optimize.descend import Descent, descend
 from jaxcontact.optimize.driver import optimize
 from jaxcontact.optimize.homotopy import Homotopy

@@ -27,10 +27,10 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxcontact.contact.probe import with_probe
-from jaxcontact.optimize.bounds import free_variables, mask
-from jaxcontact.optimize.problem import Problem
-from jaxcontact.stepper import Stepper
-from jaxcontact.trajectory import Trajectory
+from jaxcontact.control.bounds import free_variables, mask
+from jaxcontact.control.problem import Problem
+from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.trajectory import Trajectory
 
 #: Multipliers above minus this times the largest one count as not negative.
 SIGN_TOLERANCE = 1e-6

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.control.inner_products import InnerProduct
+from jaxcontact.control.problem import Point, identity, select, value_and_gradient
 from jaxcontact.optimize.driver import check_method, choose_product, make_bounds
-from jaxcontact.optimize.inner_products import InnerProduct
 from jaxcontact.optimize.lbfgs import LBFGS
-from jaxcontact.optimize.problem import Point, identity, select, value_and_gradient
-from jaxcontact.precision import in_full_precision
-from jaxcontact.system import System
+from jaxcontact.system.system import System
+from jaxcontact.transforms.precision import in_full_precision
 
 
 @jax.tree_util.register_dataclass

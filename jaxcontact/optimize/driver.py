@@ -13,14 +13,14 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jaxcontact.control.inner_products import L2, InnerProduct, lumped_l2
+from jaxcontact.control.problem import Point, Problem
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
-from jaxcontact.optimize.inner_products import L2, InnerProduct, lumped_l2
 from jaxcontact.optimize.lbfgs import LBFGS
-from jaxcontact.optimize.problem import Point, Problem
 from jaxcontact.optimize.progress import progress_bar
 from jaxcontact.optimize.result import History, Result, rebuild_state
-from jaxcontact.precision import in_full_precision
-from jaxcontact.system import System
+from jaxcontact.system.system import System
+from jaxcontact.transforms.precision import in_full_precision
 
 
 class Method(Protocol):

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from jaxcontact.contact.relaxed import RelaxedContact, with_contact
+from jaxcontact.control.problem import Point, Problem
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
-from jaxcontact.optimize.problem import Point, Problem
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
 #: The first relaxation changes the objective at the start by about this fraction.

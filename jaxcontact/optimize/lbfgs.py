@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.optimize.bounds import free_variables, mask, move
+from jaxcontact.control.bounds import free_variables, mask, move
+from jaxcontact.control.problem import Point, Problem, select
 from jaxcontact.optimize.line_search import Trial, WeakWolfe
-from jaxcontact.optimize.problem import Point, Problem, select
 
 
 class LBFGSState(NamedTuple):

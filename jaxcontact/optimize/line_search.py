@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.optimize.problem import select
+from jaxcontact.control.problem import select
 
 
 class Trial(NamedTuple):

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.optimize.bounds import free_variables, mask, move
-from jaxcontact.optimize.problem import ROUNDING, Point, Problem
+from jaxcontact.control.bounds import free_variables, mask, move
+from jaxcontact.control.problem import ROUNDING, Point, Problem
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
 

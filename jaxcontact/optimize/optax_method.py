@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxcontact.optimize.problem import Point, Problem
+from jaxcontact.control.problem import Point, Problem
 
 
 class OptaxState(NamedTuple):

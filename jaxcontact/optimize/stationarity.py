@@ -8,13 +8,13 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.control.inner_products import InnerProduct
+from jaxcontact.control.problem import as_partial
+from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.optimize.driver import state_problem
-from jaxcontact.optimize.inner_products import InnerProduct
-from jaxcontact.optimize.problem import as_partial
-from jaxcontact.precision import in_full_precision
-from jaxcontact.system import System
-from jaxcontact.trajectory import Trajectory
+from jaxcontact.system.system import System
+from jaxcontact.transforms.precision import in_full_precision
 
 
 @in_full_precision

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.optimize.problem import ROUNDING, Point, Problem, select
+from jaxcontact.control.problem import ROUNDING, Point, Problem, select
 
 
 class SteepestDescentState(NamedTuple):

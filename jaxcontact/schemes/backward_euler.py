@@ -19,7 +19,7 @@ from jax import Array
 from jaxcontact.schemes.contact_implicit import ImplicitOperators
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.system import System
+from jaxcontact.system.system import System
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from jaxcontact.contact import ContactProblem, Guess
 from jaxcontact.schemes.contact_implicit import ContactImplicit
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.sparse import ComponentwiseMatrix, SymmetricMatrix
-from jaxcontact.system import System
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
+from jaxcontact.system.system import System
 
 
 @jax.tree_util.register_dataclass

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, Protocol
 from jax import Array
 
 from jaxcontact.contact import ContactProblem, Guess
-from jaxcontact.sparse import SymmetricMatrix
-from jaxcontact.system import System
+from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.system import System
 
 
 class StepState(NamedTuple):

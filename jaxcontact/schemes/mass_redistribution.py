@@ -28,8 +28,8 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.schemes.block_matrix import BlockMatrix, from_symmetric, on_host, scatter
-from jaxcontact.system import System
+from jaxcontact.system.block_matrix import BlockMatrix, from_symmetric, on_host, scatter
+from jaxcontact.system.system import System
 
 #: How dear a tangential offset of a donor is, against a distant donor.
 OFFSET_PENALTY = 1e4

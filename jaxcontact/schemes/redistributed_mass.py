@@ -24,12 +24,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import ContactProblem
-from jaxcontact.schemes.block_matrix import from_symmetric
 from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
 from jaxcontact.schemes.mass_redistribution import redistribute, tangential_projection
 from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.sparse import ComponentwiseMatrix, SymmetricMatrix
-from jaxcontact.system import System
+from jaxcontact.system.block_matrix import from_symmetric
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
+from jaxcontact.system.system import System
 
 
 @jax.tree_util.register_dataclass

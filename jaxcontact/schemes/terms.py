@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.system import System
+from jaxcontact.system.system import System
 
 
 def viscous_loss(system: System, dt: Array, increment: Array) -> Array:

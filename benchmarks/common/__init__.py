@@ -1,0 +1,1 @@
+"""What the benchmarks share: scenes, exact solutions, and how time is measured and recorded."""

@@ -1,0 +1,1 @@
+"""What a motion is asked for: costs, controls, and the problem that an optimiser sees."""

@@ -1,0 +1,189 @@
+"""What a control may be asked for: a motion, a contact force, a time in contact.
+
+The tracking cost of the paper, (4.26) with the final-time observation of section 5, is
+
+    J(y, u) = tau/2 sum_k 1/2 (|y_{k-1} - y_d,{k-1}|^2 + |y_k - y_d,k|^2)
+              + alpha/2 tau sum_k |u_k|^2 + gamma |y_T - y_d,T|^2        (gamma without 1/2)
+
+in the L2 norm of the body, without density; |y - y_d| may also be taken on a part of the boundary
+or on chosen nodes. Energies are in `energy`. Costs add up: every term is a differentiable function
+of the trajectory, and so is any other JAX function of it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jaxcontact.control.inner_product import nodal_norms
+from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.system.assembly import nodal_areas
+from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.system import System
+from jaxcontact.transforms.precision import in_full_precision
+
+
+class TrackingCost:
+    """Tracking-type cost functional, a function of trajectory and control."""
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        dt: float | Array,
+        target: Array,
+        control_weight: float | Array = 0.0,
+        final_weight: float | Array = 0.0,
+        facets: np.ndarray | None = None,
+        nodes: np.ndarray | None = None,
+    ):
+        """Define the functional.
+
+        Args:
+            system: the discretised scene.
+            dt: length of a time step tau, [s].
+            target: desired displacement y_d, (T+1, N, d) [m].
+            control_weight: Tychonoff parameter alpha.
+            final_weight: weight gamma of the final-time observation.
+            facets: nodes of each facet (F, d), such as `mesh.facets["top"]`: track the trace on
+                this part of the boundary, in its L2 norm with nodal quadrature, not the body.
+            nodes: node numbers (R,): track these nodes, in the Euclidean norm, not the body.
+
+        Raises:
+            ValueError: if the target does not have the shape (T+1, N, d), if facets or nodes are
+                not in the mesh, or if both are given.
+        """
+        shape = (system.n_nodes, system.dimension)
+        if np.ndim(target) != 3 or np.shape(target)[1:] != shape:
+            raise ValueError(
+                f"target must have shape (T+1, N, d) = (T+1, {shape[0]}, {shape[1]}), got "
+                f"{np.shape(target)}"
+            )
+        self.nodal_mass = system.nodal_mass
+        self.observation = _observation(system, facets, nodes)
+        self.dt = dt
+        self.target = target
+        self.control_weight = control_weight
+        self.final_weight = final_weight
+
+    @in_full_precision
+    def __call__(self, trajectory: Trajectory, control: Array | None = None) -> Array:
+        """Return the value of the functional, a scalar.
+
+        Args:
+            trajectory: states of T steps.
+            control: the control that is penalised, (T, N, d), before any scaling; None if there
+                is none.
+
+        Raises:
+            ValueError: if the trajectory or the control does not have the T steps of the target.
+        """
+        steps = np.shape(self.target)[0] - 1
+        if np.shape(trajectory.displacement) != np.shape(self.target):
+            raise ValueError(
+                f"the trajectory has displacements {np.shape(trajectory.displacement)}, the "
+                f"target {np.shape(self.target)}; both must hold the same T+1 time levels"
+            )
+        if control is not None and np.shape(control) != (steps, *np.shape(self.target)[1:]):
+            raise ValueError(
+                f"control must have shape {(steps, *np.shape(self.target)[1:])}, got "
+                f"{np.shape(control)}"
+            )
+        return _tracking_cost(
+            self.nodal_mass,
+            self.observation,
+            self.dt,
+            self.target,
+            self.control_weight,
+            self.final_weight,
+            trajectory.displacement,
+            control,
+        )
+
+
+# Under jit with the arrays as arguments: nothing large is baked into a compiled program.
+@jax.jit
+def _tracking_cost(
+    nodal_mass: SymmetricMatrix,
+    observation: Array | None,
+    dt: Array,
+    target: Array,
+    control_weight: Array,
+    final_weight: Array,
+    displacement: Array,
+    control: Array | None,
+) -> Array:
+    if observation is None:
+        errors = nodal_norms(nodal_mass, displacement - target)
+    else:
+        errors = jnp.einsum("n,tni->t", observation, (displacement - target) ** 2)
+    cost = 0.25 * dt * jnp.sum(errors[:-1] + errors[1:]) + final_weight * errors[-1]
+    if control is not None:
+        cost = cost + 0.5 * control_weight * dt * jnp.sum(nodal_norms(nodal_mass, control))
+    return cost
+
+
+def _observation(system: System, facets: Any, nodes: Any) -> Array | None:
+    """Return the weight of each node, (N,); None is the L2 norm of the body."""
+    if facets is None and nodes is None:
+        return None
+    if facets is not None and nodes is not None:
+        raise ValueError("track either facets or nodes; add two costs to track both")
+    chosen = nodes if facets is None else facets
+    if not isinstance(chosen, Tracer):
+        chosen = np.asarray(chosen)
+        if chosen.size == 0 or chosen.min() < 0 or chosen.max() >= system.n_nodes:
+            raise ValueError(f"facets and nodes must be numbers from 0 to {system.n_nodes - 1}")
+    if facets is not None:
+        return nodal_areas(system.points, chosen)
+    return jnp.zeros(system.n_nodes, system.dtype).at[chosen].set(1.0)
+
+
+def contact_force(trajectory: Trajectory, *, dt: float | Array) -> Array:
+    """Return the sum of all normal contact forces, the mean of each step, (T,) [N]."""
+    return jnp.sum(trajectory.contact_impulse, axis=1) / dt
+
+
+def contact_force_error(
+    trajectory: Trajectory, target: float | Array, *, dt: float | Array
+) -> Array:
+    """Return 1/2 the integral over time of the square of (contact force - target), [N^2 s].
+
+    Args:
+        trajectory: T steps.
+        target: desired sum of the normal contact forces, (T,) or a number for all times [N].
+        dt: length of a time step, [s].
+
+    Returns:
+        A scalar. Its derivative by a control is zero as long as nothing touches; start from a
+        control with contact, or in `RelaxedContact`.
+
+    Raises:
+        ValueError: if the target is neither a number nor of shape (T,).
+    """
+    force = contact_force(trajectory, dt=dt)
+    if np.shape(target) not in ((), force.shape):
+        raise ValueError(
+            f"the target force must be a number or have shape {force.shape}, got {np.shape(target)}"
+        )
+    return 0.5 * dt * jnp.sum((force - target) ** 2)
+
+
+def contact_time(trajectory: Trajectory, *, dt: float | Array, force_scale: float | Array) -> Array:
+    """Return the time in contact, tau sum_k F_k / (F_k + F_0), a scalar [s].
+
+    A step counts in full where the contact force F_k is large against F_0, and not without
+    contact. The number of steps in contact itself is an integer, and its derivative zero.
+
+    Args:
+        trajectory: T steps.
+        dt: length of a time step, [s].
+        force_scale: F_0 > 0, a small fraction of the force in contact [N].
+    """
+    force = contact_force(trajectory, dt=dt)
+    return dt * jnp.sum(force / (force + force_scale))

@@ -1,0 +1,143 @@
+"""Ready-made scenes: the half disc of the paper's section 5 and its optimal control problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact.control.cost import TrackingCost
+from jaxcontact.motion.simulate import simulate
+from jaxcontact.motion.stepper import Stepper, prepare
+from jaxcontact.scene import meshes
+from jaxcontact.scene.material import KelvinVoigt
+from jaxcontact.scene.obstacle import HalfSpace
+from jaxcontact.scene.scene import Scene
+from jaxcontact.system.system import System, discretize
+
+RADIUS = 15.0
+
+
+def half_disc(h: float = RADIUS / 8, gap: float = 0.8) -> Scene:
+    """Return the half disc of the paper above a rigid plane.
+
+    Radius 15 m, flat side clamped on top, contact on the middle third of the arc, E = 1e8 Pa,
+    nu = 0.3, bulk and shear viscosity 1e4 Pa s, density 1 kg/m^2.
+
+    Args:
+        h: mesh size, [m]; the default has 200 unknowns.
+        gap: height of the lowest point above the plane, [m].
+    """
+    return Scene(
+        mesh=meshes.half_disc(RADIUS, h=h),
+        material=KelvinVoigt(
+            young=1e8, poisson=0.3, bulk_viscosity=1e4, shear_viscosity=1e4, density=1.0
+        ),
+        clamped=("clamped",),
+        contact={
+            "contact": HalfSpace(point=np.array([0.0, -RADIUS - gap]), normal=np.array([0.0, 1.0]))
+        },
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ControlProblem:
+    """The optimal control problem: find the volume force that makes the body follow a target."""
+
+    scene: Scene
+    """The body and its obstacle."""
+
+    system: System
+    """The discretised scene."""
+
+    stepper: Stepper
+    """The prepared time-stepping scheme."""
+
+    reference: Array
+    """The control that made the target, (T, N, d), before scaling."""
+
+    target: Array
+    """Desired displacement y_d, (T+1, N, d) [m]."""
+
+    dt: float = field(metadata={"static": True})
+    """Length of a time step tau, [s]."""
+
+    steps: int = field(metadata={"static": True})
+    """Number of time steps T."""
+
+    control_scale: float = field(metadata={"static": True})
+    """Force density of a control of one, [N/m^2]."""
+
+    control_weight: float = field(metadata={"static": True})
+    """Tychonoff parameter alpha."""
+
+    final_weight: float = field(metadata={"static": True})
+    """Weight gamma of the final-time observation."""
+
+    def simulate(self, u: Array):
+        """Return the trajectory of a control u (T, N, d), before scaling."""
+        return simulate(self.stepper, self.control_scale * u)
+
+    def cost(self) -> TrackingCost:
+        """Return the tracking functional."""
+        return TrackingCost(
+            self.system,
+            dt=self.dt,
+            target=self.target,
+            control_weight=self.control_weight,
+            final_weight=self.final_weight,
+        )
+
+    def objective(self, u: Array) -> Array:
+        """Return the reduced functional J(S(u), u) of a control u (T, N, d), a scalar."""
+        return self.cost()(self.simulate(u), u)
+
+
+def half_disc_control(
+    h: float = RADIUS / 8,
+    steps: int = 150,
+    dt: float = 5e-5,
+    gap: float = 0.8,
+    *,
+    control_scale: float = 1e6,
+    control_weight: float = 1e-2,
+    final_weight: float = 7.5e-4,
+    dtype=jnp.float64,
+    **prepare_options,
+) -> ControlProblem:
+    """Return the optimal control problem of the paper's section 5.
+
+    The target is the motion under the reference control u = -e_n on the whole body at all times.
+
+    Args:
+        h: mesh size, [m].
+        steps: number of time steps T; 150 or, for the horizon of 0.075 s, 1500.
+        dt: length of a time step, [s].
+        gap: height of the lowest point above the plane, [m].
+        control_scale: force density of a control of one, [N/m^2].
+        control_weight: Tychonoff parameter alpha.
+        final_weight: weight gamma of the final-time observation.
+        dtype: floating point type.
+        **prepare_options: scheme and solvers, see `prepare`.
+    """
+    scene = half_disc(h, gap)
+    system = discretize(scene, dtype=dtype)
+    stepper = prepare(system, dt, **prepare_options)
+    down = jnp.zeros(system.dimension, dtype).at[-1].set(-1.0)
+    reference = jnp.broadcast_to(down, (steps, system.n_nodes, system.dimension))
+    return ControlProblem(
+        scene=scene,
+        system=system,
+        stepper=stepper,
+        reference=reference,
+        target=simulate(stepper, control_scale * reference).displacement,
+        dt=dt,
+        steps=steps,
+        control_scale=control_scale,
+        control_weight=control_weight,
+        final_weight=final_weight,
+    )

@@ -1,0 +1,1 @@
+"""Nested dissection with dense fronts: order, plan, factorise, sweep."""

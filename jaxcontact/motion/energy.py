@@ -1,0 +1,116 @@
+"""The energy ledger of a simulation: where the energy of every step went.
+
+With E = 1/2 v.Mv + 1/2 y.Ay, each step of a scheme satisfies an identity
+
+    E' - E = work - viscous loss - impact loss - numerical loss        (to rounding)
+
+with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxcontact.contact import Guess
+from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.schemes import StepState
+from jaxcontact.transforms.precision import in_full_precision
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Energy:
+    """Energies at the T+1 time levels and energy flows of the T steps, all [J]."""
+
+    kinetic: Array
+    """1/2 v.Mv, (T+1,) [J]."""
+
+    elastic: Array
+    """1/2 y.Ay, (T+1,) [J]."""
+
+    change: Array
+    """E' - E of each step, (T,) [J], to the digits of the step: the difference of two `total` loses
+    those of y.Ay, whose terms are (L/h)^2 times as large as their sum."""
+
+    work: Array
+    """Work of control, body force and traction in each step, (T,) [J]."""
+
+    viscous_loss: Array
+    """Energy dissipated by the viscosity in each step, (T,) [J], not negative."""
+
+    impact_loss: Array
+    """Energy taken by the contact in each step, (T,) [J]."""
+
+    numerical_loss: Array
+    """Energy taken by the time discretisation in each step, (T,) [J]; zero for the schemes that
+    are trapezoidal without contact."""
+
+    residual: Array
+    """What the ledger misses in each step, (T,) [J]; rounding only."""
+
+    @property
+    def total(self) -> Array:
+        """Kinetic plus elastic energy, (T+1,) [J]."""
+        return self.kinetic + self.elastic
+
+
+@in_full_precision
+@jax.jit
+def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = None) -> Energy:
+    """Return the energy ledger of a trajectory.
+
+    Args:
+        stepper: the stepper that made the trajectory.
+        trajectory: every state of it, T steps.
+        control: the control that made it, (T, N, d) [N/m^d].
+
+    Returns:
+        Energies and flows; the identity of the module docstring holds to rounding.
+    """
+    system, operators = stepper.system, stepper.operators
+
+    def nothing_yet(record: Array) -> Array:
+        return jnp.concatenate([jnp.zeros_like(record[:1]), record])
+
+    states = StepState(
+        displacement=system.restrict(trajectory.displacement),
+        velocity=system.restrict(trajectory.velocity),
+        impulse=nothing_yet(trajectory.contact_impulse),
+        guess=Guess(nothing_yet(trajectory.active)),
+    )
+
+    def measure(state: StepState) -> tuple[Array, Array]:
+        kinetic = 0.5 * jnp.dot(state.velocity, operators.mass @ state.velocity)
+        elastic = 0.5 * jnp.dot(state.displacement, system.stiffness @ state.displacement)
+        return kinetic, elastic
+
+    def flow(old: StepState, new: StepState, force: Array | None):
+        load = system.load if force is None else system.load + system.control_load(force)
+        velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
+        change = 0.5 * (
+            jnp.dot(new.velocity - old.velocity, operators.mass @ velocity)
+            + jnp.dot(new.displacement - old.displacement, system.stiffness @ displacement)
+        )
+        return change, stepper.scheme.energy_flow(system, operators, stepper.dt, old, new, load)
+
+    kinetic, elastic = jax.lax.map(measure, states)
+    old = jax.tree.map(lambda record: record[:-1], states)
+    new = jax.tree.map(lambda record: record[1:], states)
+    change, flows = jax.lax.map(lambda step: flow(*step), (old, new, control))
+    numerical_loss = jnp.asarray(flows.numerical_loss, change.dtype)
+    loss = flows.viscous_loss + flows.impact_loss + numerical_loss
+    return Energy(
+        kinetic=kinetic,
+        elastic=elastic,
+        change=change,
+        work=flows.work,
+        viscous_loss=flows.viscous_loss,
+        impact_loss=flows.impact_loss,
+        numerical_loss=numerical_loss,
+        residual=change - (flows.work - loss),
+    )

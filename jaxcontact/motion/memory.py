@@ -1,0 +1,140 @@
+"""Predict the memory of a run and of its gradient before anything runs.
+
+With T steps, K = T / save_every recorded states and S segments of a checkpoint, in numbers:
+
+    trajectory    K (2 N d + n)              displacement, velocity, and the unknowns they are of
+    residuals     T C / 8                    one boolean per pair and step: loads, initial state
+                  T (5 n + 3 C)              if matrices are differentiated (y, v, w, ...)
+    checkpoint    (T / S) (...) + 2 S n      residuals of one segment, and the start of each
+    cotangents    K N d + T N d              of the recorded displacement and of the control
+
+The factors are those of the compiled programs; the prediction holds within a factor of two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcontact.motion.stepper import Stepper
+from jaxcontact.transforms.time_loop import Checkpoint
+
+#: Vectors (n,) that one step needs beside its state, for the sweeps over the factor.
+WORKSPACE_VECTORS = 32
+#: Vectors (n,) and (C,) that a step keeps for the derivative by a matrix.
+MATRIX_RESIDUALS = (5, 3)
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Predicted memory of a run, in bytes."""
+
+    stepper: int
+    """Matrices and factor; an argument of the run."""
+
+    trajectory: int
+    """Recorded states and contact records."""
+
+    residuals: int
+    """What the steps keep for the backward pass, states at checkpoints included."""
+
+    cotangents: int
+    """Derivatives by the recorded displacement, the control, and the matrices if asked for."""
+
+    workspace: int
+    """Vectors of one step."""
+
+    @property
+    def total(self) -> int:
+        """Sum of all parts."""
+        return sum(getattr(self, part.name) for part in fields(self))
+
+    def __str__(self) -> str:
+        """Return one line per part."""
+        names = [*(part.name for part in fields(self)), "total"]
+        return "\n".join(f"{name:<11}{_readable(getattr(self, name)):>10}" for name in names)
+
+
+def estimate_memory(
+    stepper: Stepper,
+    steps: int,
+    *,
+    gradient: bool = False,
+    matrix_gradient: bool = False,
+    save_every: int = 1,
+    checkpoint: Checkpoint | None = None,
+) -> MemoryEstimate:
+    """Predict the memory of `simulate` and of its gradient; nothing is run or compiled.
+
+    Args:
+        stepper: from `prepare`, or its shapes by `jax.eval_shape`.
+        steps: number of steps T.
+        gradient: add what value and gradient by control (T, N, d) and initial state need.
+        matrix_gradient: add what the gradient by material, obstacle or dt needs.
+        save_every: as in `simulate`.
+        checkpoint: as in `simulate`.
+
+    Returns:
+        The estimate. The control and what the cost function holds, such as a target, are not
+        in it.
+
+    Raises:
+        ValueError: if steps or save_every are not positive or save_every does not divide steps.
+    """
+    if steps < 1 or save_every < 1 or steps % save_every:
+        raise ValueError(
+            f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
+        )
+    system = stepper.system
+    item = jnp.dtype(system.dtype).itemsize
+    n_pairs = system.normals.count
+    vector, pairs = item * system.size, item * n_pairs
+    field = item * system.n_nodes * system.dimension
+    n_records = steps // save_every
+
+    trajectory = (n_records + 1) * (2 * field + vector + pairs + item)
+    trajectory += steps * (pairs + 2 * n_pairs + 8 + item)
+    residuals = cotangents = 0
+    if gradient or matrix_gradient:
+        per_step = n_pairs + item
+        if matrix_gradient:
+            per_step += MATRIX_RESIDUALS[0] * vector + MATRIX_RESIDUALS[1] * pairs
+        residuals = steps * per_step
+        cotangents = n_records * field
+        if checkpoint is not None:
+            segments = checkpoint.count(n_records)
+            length = -(-n_records // segments) * save_every
+            residuals = length * per_step + segments * (2 * vector + pairs + n_pairs)
+    if gradient:
+        # A checkpoint rearranges the control by segments: a second copy.
+        cotangents += steps * field * (1 if checkpoint is None else 2)
+    if matrix_gradient:
+        cotangents += _float_bytes(system)
+    return MemoryEstimate(
+        stepper=_bytes(stepper),
+        trajectory=trajectory,
+        residuals=residuals,
+        cotangents=cotangents,
+        workspace=WORKSPACE_VECTORS * vector,
+    )
+
+
+def _bytes(tree: Any) -> int:
+    """Return the bytes of all arrays of a pytree."""
+    return sum(x.size * jnp.dtype(x.dtype).itemsize for x in jax.tree.leaves(tree))
+
+
+def _float_bytes(tree: Any) -> int:
+    """Return the bytes of the arrays of a pytree that have a derivative."""
+    return sum(_bytes(x) for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating))
+
+
+def _readable(n_bytes: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if n_bytes < 1000:
+            return f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.3g} GB"

@@ -1,0 +1,133 @@
+"""A scene: one body, its material, how it is held and loaded, and what it may touch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jaxcontact.scene.material import KelvinVoigt, check_material
+from jaxcontact.scene.mesh import Mesh
+from jaxcontact.scene.obstacle import Obstacle, check_obstacle
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """A viscoelastic body and the rigid obstacles it may meet, without friction.
+
+    `discretize` checks a scene and turns it into matrices.
+    """
+
+    mesh: Mesh
+    """The body in its stress-free reference configuration."""
+
+    material: KelvinVoigt | Mapping[str, KelvinVoigt]
+    """One material, or one for each region of the mesh (then every cell is in one region)."""
+
+    clamped: tuple[str, ...] = field(default=(), metadata={"static": True})
+    """Names of the facet sets that are held at zero displacement."""
+
+    contact: Mapping[str, Obstacle] = field(default_factory=dict)
+    """Facet sets that may touch, with the obstacle that each may touch."""
+
+    traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
+    """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
+
+    body_force: Array | np.ndarray | None = None
+    """Constant volume force, (d,) [N/m^d]; None is none."""
+
+
+def check_scene(scene: Scene) -> None:
+    """Check everything in a scene that is concrete.
+
+    Raises:
+        ValueError: if a name is not in the mesh, clamped and contact sets share nodes, a vector
+            has the wrong shape or is not finite, or a material value is out of range.
+    """
+    mesh = scene.mesh
+    if isinstance(scene.clamped, str):
+        raise ValueError(f"clamped must be a tuple of names; write clamped=({scene.clamped!r},)")
+    for name in (*scene.clamped, *scene.contact, *scene.traction):
+        if name not in mesh.facets:
+            raise ValueError(f"facet set {name!r} is not in the mesh; it has {sorted(mesh.facets)}")
+    clamped = clamped_nodes(scene)
+    for name, obstacle in scene.contact.items():
+        shared = np.intersect1d(clamped, mesh.facets[name])
+        if shared.size:
+            raise ValueError(
+                f"contact set {name!r} and the clamped sets {sorted(scene.clamped)} share "
+                f"{shared.size} nodes, first {shared[:5].tolist()}; a clamped node cannot be in "
+                "contact: leave a row of facets between the two sets"
+            )
+        check_obstacle(obstacle, mesh.dimension)
+    vectors = {f"traction[{name!r}]": vector for name, vector in scene.traction.items()}
+    if scene.body_force is not None:
+        vectors["body_force"] = scene.body_force
+    for name, vector in vectors.items():
+        _check_vector(name, vector, mesh.dimension)
+    _check_materials(scene)
+
+
+def clamped_nodes(scene: Scene) -> np.ndarray:
+    """Return the sorted clamped nodes, (n_clamped,) int32."""
+    sets = [np.ravel(scene.mesh.facets[name]) for name in scene.clamped]
+    return np.unique(np.concatenate(sets)) if sets else np.zeros(0, np.int32)
+
+
+def cellwise_material(scene: Scene) -> KelvinVoigt:
+    """Return the material with scalar fields, or with one value per cell (E,) if regions differ."""
+    if isinstance(scene.material, KelvinVoigt):
+        return scene.material
+    region_of_cell = np.zeros(scene.mesh.n_cells, np.int32)
+    for number, region in enumerate(scene.material):
+        region_of_cell[scene.mesh.regions[region]] = number
+    return jax.tree.map(
+        lambda *values: jnp.stack([jnp.asarray(value, float) for value in values])[region_of_cell],
+        *scene.material.values(),
+    )
+
+
+def is_elastic(scene: Scene) -> bool:
+    """Return True if every material of the scene is known to have no viscosity."""
+    if isinstance(scene.material, KelvinVoigt):
+        return scene.material.is_elastic()
+    return all(material.is_elastic() for material in scene.material.values())
+
+
+def _check_vector(name: str, vector: Any, dimension: int) -> None:
+    if np.shape(vector) != (dimension,):
+        raise ValueError(f"{name} must have shape ({dimension},), got {np.shape(vector)}")
+    if not isinstance(vector, Tracer) and not np.all(np.isfinite(np.asarray(vector))):
+        raise ValueError(f"{name} must be finite, got {vector}")
+
+
+def _check_materials(scene: Scene) -> None:
+    if isinstance(scene.material, KelvinVoigt):
+        check_material(scene.material)
+        return
+    if not isinstance(scene.material, Mapping):
+        raise ValueError(
+            "material must be a KelvinVoigt or a mapping from region names to KelvinVoigt, got "
+            f"{type(scene.material).__name__}"
+        )
+    covered = np.zeros(scene.mesh.n_cells, int)
+    for region, material in scene.material.items():
+        if region not in scene.mesh.regions:
+            raise ValueError(
+                f"region {region!r} is not in the mesh; it has {sorted(scene.mesh.regions)}"
+            )
+        check_material(material)
+        covered[scene.mesh.regions[region]] += 1
+    if np.any(covered != 1):
+        wrong = np.flatnonzero(covered != 1)
+        raise ValueError(
+            f"{wrong.size} cells are not in exactly one region with a material, first "
+            f"{wrong[:5].tolist()}; give every cell one material"
+        )

@@ -1,0 +1,300 @@
+"""From a scene to its matrices: the semi-discrete system of MATH.md 1.
+
+    M y'' + B y' + A y + N^T p = f,    N y <= psi,  p >= 0,  p . (psi - N y) = 0
+
+on the n unknowns: the displacement components of the nodes that are not clamped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact.scene.material import KelvinVoigt
+from jaxcontact.scene.obstacle import gap_and_normals
+from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
+from jaxcontact.system import assembly
+from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
+from jaxcontact.transforms.precision import in_full_precision
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Basis:
+    """The space of a reduced model: y = vectors q, with M-orthonormal vectors."""
+
+    vectors: Array
+    """Basis vectors, (n_full, n): displacement components of the free nodes."""
+
+    projector: Array
+    """M vectors, (n_full, n): q = projector^T y is the M-orthogonal projection."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class System:
+    """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
+
+    mass: ComponentwiseMatrix | SymmetricMatrix
+    """M, consistent mass matrix with density, (n, n) [kg]; dense in a reduced model."""
+
+    stiffness: SymmetricMatrix
+    """A, elastic stiffness matrix, (n, n) [N/m]."""
+
+    viscosity: SymmetricMatrix | None
+    """B, viscosity matrix, (n, n) [N s/m]; None if the material has no viscosity."""
+
+    l2_mass: ComponentwiseMatrix | SymmetricMatrix
+    """L on the unknowns: mass matrix without density, (n, n) [m^d]."""
+
+    nodal_mass: SymmetricMatrix
+    """Scalar L on all nodes, (N, N) [m^d]; the inner product of controls (N, d), clamped too."""
+
+    normals: ContactNormals
+    """N, contact operator, (C, n); rows point from the body to the obstacle."""
+
+    gap: Array
+    """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
+
+    load: Array
+    """Constant load of body force and traction, (n,) [N]."""
+
+    contact_nodes: np.ndarray
+    """Node of each contact pair, (C,) int32."""
+
+    contact_area: Array
+    """Integral of the hat function over the contact set, (C,) [m^(d-1)]; impulse / (dt area)
+    is the contact pressure."""
+
+    points: Array
+    """Node positions in the reference configuration, (N, d) [m]."""
+
+    free_nodes: np.ndarray
+    """Nodes that are not clamped, (n/d,) int32."""
+
+    node_numbers: np.ndarray
+    """Position of each node among the free ones, (N,) int32; n/d for a clamped node."""
+
+    dimension: int = field(metadata={"static": True})
+    """Space dimension d."""
+
+    basis: Basis | None = None
+    """Space of a reduced model (see `reduce`); None is all displacement components."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, n."""
+        return self.load.shape[-1]
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of mesh nodes, N."""
+        return self.points.shape[-2]
+
+    @property
+    def is_clamped(self) -> bool:
+        """Whether some nodes are clamped."""
+        return len(self.free_nodes) < self.n_nodes
+
+    @property
+    def dtype(self):
+        """Floating point type of every array."""
+        return self.load.dtype
+
+    def lift(self, x: Array) -> Array:
+        """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
+        return _lift(self, x)
+
+    @in_full_precision
+    def restrict(self, y: Array) -> Array:
+        """Return the unknowns (..., n) of a nodal field (..., N, d).
+
+        Of a reduced model, the unknowns of the M-orthogonal projection.
+        """
+        free = _free_components(self, y)
+        return free if self.basis is None else free @ self.basis.projector
+
+    @in_full_precision
+    def control_load(self, control: Array) -> Array:
+        """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
+        load = _free_components(self, self.nodal_mass @ control)
+        return load if self.basis is None else load @ self.basis.vectors
+
+
+@in_full_precision
+def discretize(scene: Scene, dtype=jnp.float64) -> System:
+    """Assemble the P1 system of a scene.
+
+    Traceable in material, obstacles, loads and node positions; the connectivity and the names
+    must be concrete.
+
+    Args:
+        scene: the scene.
+        dtype: floating point type, float64 or float32.
+
+    Returns:
+        The system, with n = d (number of nodes that are not clamped) unknowns.
+
+    Raises:
+        ValueError: if the scene is inconsistent (see `check_scene`) or leaves nothing to move.
+        RuntimeError: if float64 is asked for while JAX has it switched off.
+    """
+    dtype = jnp.dtype(dtype)
+    _check_dtype(dtype)
+    check_scene(scene)
+    mesh, dimension = scene.mesh, scene.mesh.dimension
+    points = jnp.asarray(mesh.points, dtype)
+    cells = np.asarray(mesh.cells)
+
+    is_free = np.ones(mesh.n_nodes, bool)
+    is_free[clamped_nodes(scene)] = False
+    free_nodes = np.flatnonzero(is_free).astype(np.int32)
+    if free_nodes.size == 0:
+        raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
+    numbers = np.where(is_free, np.cumsum(is_free) - 1, -1)
+
+    pattern = assembly.node_pattern(cells, numbers)
+    all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
+    values = _assemble(
+        points,
+        cells,
+        cellwise_material(scene),
+        pattern,
+        all_nodes,
+        None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
+        {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
+        is_elastic=is_elastic(scene),
+    )
+    nodes, gap, vectors, area = _contact_pairs(scene, points)
+    components = np.arange(dimension, dtype=np.int32)
+    unknowns = numbers[nodes].astype(np.int32)[:, None] * dimension + components[None, :]
+
+    def on_free(values: Array) -> SymmetricMatrix:
+        return SymmetricMatrix(values, pattern.columns)
+
+    return System(
+        mass=ComponentwiseMatrix(on_free(values.mass), dimension),
+        stiffness=on_free(values.stiffness),
+        viscosity=None if values.viscosity is None else on_free(values.viscosity),
+        l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
+        nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
+        normals=ContactNormals(vectors, unknowns),
+        gap=gap,
+        load=values.load[free_nodes].reshape(-1),
+        contact_nodes=nodes,
+        contact_area=area,
+        points=points,
+        free_nodes=free_nodes,
+        node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
+        dimension=dimension,
+    )
+
+
+class _Values(NamedTuple):
+    """Entries of the matrices in ELL layout, those of the masses scalar; nodal load (N, d)."""
+
+    mass: Array
+    stiffness: Array
+    viscosity: Array | None
+    l2_mass: Array
+    nodal_mass: Array
+    load: Array
+
+
+# One program for all of it: compiling operation by operation takes seconds for every new mesh.
+@partial(jax.jit, static_argnames="is_elastic")
+def _assemble(
+    points: Array,
+    cells: Array,
+    material: KelvinVoigt,
+    pattern: assembly.NodePattern,
+    all_nodes: assembly.NodePattern,
+    body_force: Array | None,
+    tractions: dict[str, tuple[Array, Array]],
+    *,
+    is_elastic: bool,
+) -> _Values:
+    dimension = points.shape[1]
+    gradients, volumes = assembly.hat_gradients(points, cells)
+    l2_blocks = assembly.mass_blocks(volumes, dimension)
+    density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
+
+    def isotropic(lame: tuple) -> Array:
+        blocks = assembly.stiffness_blocks(gradients, volumes, lame)
+        return assembly.assemble(pattern, blocks)
+
+    load = jnp.zeros(points.shape, points.dtype)
+    if body_force is not None:
+        shares = jnp.repeat(volumes / (dimension + 1), dimension + 1)
+        weights = jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(cells)].add(shares)
+        load = load + weights[:, None] * body_force[None, :]
+    for facets, traction in tractions.values():
+        load = load + assembly.nodal_areas(points, facets)[:, None] * traction[None, :]
+    return _Values(
+        mass=assembly.assemble(pattern, density[:, None, None, None, None] * l2_blocks),
+        stiffness=isotropic(material.elastic_lame()),
+        viscosity=None if is_elastic else isotropic(material.viscous_lame()),
+        l2_mass=assembly.assemble(pattern, l2_blocks),
+        nodal_mass=assembly.assemble(all_nodes, l2_blocks),
+        load=load,
+    )
+
+
+def _check_dtype(dtype) -> None:
+    if dtype not in (jnp.float32, jnp.float64):
+        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
+    if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
+            "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
+        )
+
+
+def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Array, Array]:
+    """Return node (C,), gap (C,), normal (C, d) and area (C,) of every contact pair."""
+    nodes, gaps, normals, areas = [], [], [], []
+    # Sets with one obstacle are one set: a node that is in both must not get the same pair twice.
+    sets: dict[int, list[str]] = {}
+    for name in sorted(scene.contact):
+        sets.setdefault(id(scene.contact[name]), []).append(name)
+    for names in sets.values():
+        facets = np.unique(np.concatenate([scene.mesh.facets[name] for name in names]), axis=0)
+        set_nodes = np.unique(facets)
+        gap, vectors = gap_and_normals(scene.contact[names[0]], points[set_nodes])
+        nodes.append(set_nodes)
+        gaps.append(gap)
+        normals.append(vectors)
+        areas.append(assembly.nodal_areas(points, facets)[set_nodes])
+    if not nodes:
+        nothing = jnp.zeros(0, points.dtype)
+        return np.zeros(0, np.int32), nothing, points[:0], nothing
+    return (
+        np.concatenate(nodes).astype(np.int32),
+        jnp.concatenate(gaps),
+        jnp.concatenate(normals),
+        jnp.concatenate(areas),
+    )
+
+
+def _free_components(system: System, y: Array) -> Array:
+    if system.is_clamped:
+        y = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
+    return y.reshape(*y.shape[:-2], -1)
+
+
+@in_full_precision
+def _lift(system: System, x: Array) -> Array:
+    if system.basis is not None:
+        x = x @ system.basis.vectors.T
+    free = x.reshape(*x.shape[:-1], -1, system.dimension)
+    if not system.is_clamped:
+        return free
+    padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
+    free = jnp.concatenate([free, padding], axis=-2)
+    return jnp.take(free, system.node_numbers, axis=-2, mode="clip")

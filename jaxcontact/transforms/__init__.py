@@ -1,0 +1,1 @@
+"""What JAX lacks: rules and loops that know nothing of contact."""

@@ -1,0 +1,192 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.kinked import DT, grazing
+
+import jaxcontact as jc
+from jaxcontact.contact import Guess
+
+EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
+N_PAIRS = 7
+#: Rounding of W p + q with conditions up to 1e4, relative to its terms.
+BALANCE = {"float64": 1e-12, "float32": 2e-5}
+#: Central differences with a step of 2e-6, of which curvature and rounding leave six digits.
+DIFFERENCES = 1e-6
+
+
+@partial(jax.jit, static_argnames="max_steps")
+def solve(kappa, compliance, offset, guess, max_steps=100):
+    nothing = jnp.zeros_like(offset)
+    return jc.RelaxedContact(kappa, max_steps).solve(compliance, offset, nothing, Guess(guess))
+
+
+def random_problem(seed, coupling):
+    """SPD compliance and offset; pairs of very different size, and one far off contact"""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(N_PAIRS, N_PAIRS))
+    scale = np.exp(2.0 * rng.normal(size=N_PAIRS))
+    compliance = scale[:, None] * (np.eye(N_PAIRS) + coupling * root @ root.T) * scale[None, :]
+    offset = scale * rng.normal(size=N_PAIRS)
+    offset[0] = 1e6 * scale[0]
+    size = np.max(np.abs(offset[1:]) ** 2 / np.diagonal(compliance)[1:])
+    return compliance, offset, size
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@EXAMPLES
+@given(
+    seed=st.integers(0, 10**6),
+    coupling=st.floats(0.0, 3.0),
+    decade=st.floats(-12.0, -2.0),
+    guess=st.integers(0, 2**N_PAIRS - 1),
+)
+def test_relaxed_contact_satisfies_its_law_and_the_balance(dtype, seed, coupling, decade, guess):
+    compliance, offset, size = random_problem(seed, coupling)
+    kappa = size * 10.0**decade
+    bits = (guess >> np.arange(N_PAIRS)) % 2 == 1
+    data = (jnp.asarray(compliance, dtype), jnp.asarray(offset, dtype), jnp.asarray(bits))
+    solution = solve(kappa, *data)
+    assert int(solution.status) == jc.Status.CONVERGED
+    p = np.asarray(solution.multiplier, float)
+    assert np.all(p > 0.0)
+    g = np.float64(kappa) / p
+    imbalance = np.abs(compliance @ p + offset - g)
+    size_of_terms = np.abs(compliance) @ p + np.abs(offset) + g
+    assert np.max(imbalance / size_of_terms) < BALANCE[dtype]
+
+
+def test_relaxed_contact_of_one_pair_solves_a_quadratic_equation():
+    # W p^2 + q p = kappa
+    for q in (-3.0, 0.0, 5.0):
+        p = solve(0.01, jnp.array([[2.0]]), jnp.array([q]), jnp.array([False])).multiplier
+        expected = (-q + np.sqrt(q**2 + 4 * 2.0 * 0.01)) / 4.0
+        np.testing.assert_allclose(p, expected, rtol=1e-13)
+
+
+def test_relaxed_contact_tends_to_exact_contact_linearly_in_kappa():
+    compliance, offset, size = random_problem(3, 1.0)
+    data = (jnp.asarray(compliance), jnp.asarray(offset), jnp.zeros(N_PAIRS, bool))
+    exact = (
+        jc.SemismoothNewton().solve(data[0], data[1], jnp.zeros(N_PAIRS), Guess(data[2])).multiplier
+    )
+    errors = [
+        np.max(np.abs(solve(kappa * size, *data).multiplier - exact)) for kappa in (1e-6, 1e-8)
+    ]
+    np.testing.assert_allclose(errors[0] / errors[1], 100.0, rtol=0.1)
+
+
+def test_relaxed_contact_without_enough_steps_ends_as_not_converged():
+    compliance, offset, size = random_problem(3, 3.0)
+    data = (jnp.asarray(compliance), jnp.asarray(offset), jnp.zeros(N_PAIRS, bool))
+    assert int(solve(1e-3 * size, *data, max_steps=1).status) == jc.Status.NOT_CONVERGED
+
+
+@pytest.mark.parametrize("kappa", [-1.0, 0.0, np.nan])
+def test_relaxed_contact_with_a_wrong_kappa_raises(kappa):
+    stepper = grazing(contact_solver=jc.RelaxedContact(kappa)).stepper
+    with pytest.raises(jc.SolveError):
+        jc.simulate(stepper, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "steps"), [(jc.ContactImplicit(), 2.0), (jc.BackwardEuler(), 1.0)]
+)
+def test_relaxed_motion_has_impulse_times_gap_kappa_per_step(scheme, steps):
+    kappa = 1e-3
+    problem = grazing(scheme=scheme, contact_solver=jc.RelaxedContact(kappa))
+    trajectory = problem.simulate(jnp.full((20, 2, 1), 10.0))
+    product = trajectory.contact_impulse * trajectory.gap[1:]
+    np.testing.assert_allclose(product, steps * DT * kappa, rtol=1e-9)
+
+
+@jax.jit
+def value(u, problem):
+    return problem.objective(u)
+
+
+@jax.jit
+def gradient(u, problem):
+    return jax.grad(problem.objective)(u)
+
+
+@jax.jit
+def product(u, problem, direction):
+    return jax.jvp(jax.grad(problem.objective), (u,), (direction,))[1]
+
+
+def relaxed_disc(kappa):
+    problem = jc.scenes.half_disc_control(h=15.0 / 4, steps=40, dt=1e-4, gap=0.2)
+    rng = np.random.default_rng(0)
+    u = jnp.asarray(problem.reference + 0.3 * rng.normal(size=problem.reference.shape))
+    direction = jnp.asarray(rng.normal(size=u.shape))
+    return jc.with_contact(problem, jc.RelaxedContact(kappa)), u, direction
+
+
+@pytest.mark.parametrize("kappa", [1e6, 1e2])
+def test_relaxed_gradient_and_hessian_product_match_differences(kappa):
+    problem, u, direction = relaxed_disc(kappa)
+    assert float(jnp.max(problem.simulate(u).contact_impulse)) > 100.0  # there is an impact
+    h = 2e-6
+    ahead, behind = u + h * direction, u - h * direction
+    slope = (value(ahead, problem) - value(behind, problem)) / (2 * h)
+    np.testing.assert_allclose(jnp.vdot(gradient(u, problem), direction), slope, rtol=DIFFERENCES)
+    change = (gradient(ahead, problem) - gradient(behind, problem)) / (2 * h)
+    exact = product(u, problem, direction)
+    assert float(jnp.linalg.norm(exact - change) / jnp.linalg.norm(exact)) < DIFFERENCES
+    other = jnp.roll(direction, 1)
+    np.testing.assert_allclose(
+        jnp.vdot(other, exact), jnp.vdot(direction, product(u, problem, other)), rtol=1e-9
+    )
+
+
+def test_relaxed_gradient_does_not_vanish_before_touch():
+    def impulse(u, problem):
+        return jnp.sum(problem.simulate(u).contact_impulse)
+
+    u = jnp.full((3, 2, 1), 0.5)
+    exact = grazing()
+    assert float(jnp.min(exact.simulate(u).gap)) > 0.05
+    relaxed = jc.with_contact(exact, jc.RelaxedContact(1e-6))
+    assert not np.any(jax.grad(impulse)(u, exact))
+    assert np.all(jax.grad(impulse)(u, relaxed)[:, 1] > 0.0)  # pushing on raises the impulse
+
+
+def test_relaxed_motion_compiles_once_for_all_kappas():
+    problem, u = grazing(), jnp.full((3, 2, 1), 10.0)
+    before = value._cache_size()
+    for kappa in (1e-2, 1e-5, 1e-9):
+        value(u, jc.with_contact(problem, jc.RelaxedContact(kappa)))
+    assert value._cache_size() == before + 1
+
+
+def test_relaxed_motion_maps_over_kappa():
+    problem, u = grazing(), jnp.full((3, 2, 1), 10.0)
+    kappas = jnp.array([1e-2, 1e-5])
+
+    def at(kappa):
+        return jc.with_contact(problem, jc.RelaxedContact(kappa)).objective(u)
+
+    np.testing.assert_allclose(jax.vmap(at)(kappas), [at(k) for k in kappas], rtol=1e-13)
+
+
+def test_with_contact_equals_a_new_preparation():
+    u, solver = jnp.full((3, 2, 1), 10.0), jc.RelaxedContact(1e-3)
+    exchanged, prepared = jc.with_contact(grazing(), solver), grazing(contact_solver=solver)
+    assert float(exchanged.objective(u)) == float(prepared.objective(u))
+    assert exchanged.stepper.contact_solver == solver
+
+
+def test_with_contact_without_a_stepper_raises():
+    with pytest.raises(ValueError, match="no stepper"):
+        jc.with_contact(jnp.sum, jc.RelaxedContact(1.0))
+
+
+def test_relaxed_contact_with_conjugate_gradients_raises():
+    problem = grazing(linear_solver=jc.ConjugateGradient(), contact_solver=jc.RelaxedContact(1.0))
+    with pytest.raises(ValueError, match="RelaxedContact"):
+        jc.simulate(problem.stepper, steps=1)

@@ -1,0 +1,37 @@
+"""Claims about the benchmarks: they run from the command line and keep what they measured."""
+
+import importlib
+import json
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+#: Columns whose values the README quotes.
+RESULTS = {
+    "step_cost": ["step_us", "limit_us", "step_over_limit"],
+    "against_numpy": ["forward_superlu_over_ours", "gradient_superlu_over_ours"],
+    "gradient_cost": ["time_ratio", "memory_ratio"],
+    "batch": ["forward_per_scene_over_single", "gradient_per_scene_over_single"],
+    "compile_time": ["forward_s", "gradient_s"],
+    "contact_solvers": ["newton_cold_us", "newton_warm_us", "gauss_seidel_us"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RESULTS)
+def test_benchmark_writes_what_it_measured(name, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    plt.switch_backend("agg")
+    benchmark = importlib.import_module(name)
+    rows = benchmark.main(["--quick", "--repeats", "2", "--out", str(tmp_path)])
+    record = json.loads((tmp_path / f"{name}.json").read_text())
+    assert record["rows"] == json.loads(json.dumps(rows, default=str))
+    assert record["machine"]["cores"] >= 1
+    assert (tmp_path / f"{name}.png").stat().st_size > 1000
+    for row in record["rows"]:
+        values = [row[column] for column in RESULTS[name]]
+        assert np.all(np.isfinite(values))
+        assert np.all(np.array(values) > 0.0)

@@ -1,0 +1,1 @@
+"""Scenes and problems that several tests share."""
