@@ -1,0 +1,34 @@
+"""The check of every option: a choice is an object with the methods of its protocol."""
+
+from __future__ import annotations
+
+import textwrap
+
+#: Longest text of a wrong value that a message quotes.
+MAX_QUOTE = 80
+
+
+def check_option(name: str, value: object, protocol: type | tuple[type, ...], example: str) -> None:
+    """Raise a ValueError if an option is not an object with what its protocol asks for.
+
+    Args:
+        name: name of the keyword that the user wrote.
+        value: what the user handed over.
+        protocol: a runtime-checkable protocol or a class, or several of which one must fit.
+        example: an object that the user can write instead, without the prefix jc.; for instance
+            "ContactImplicit()".
+
+    Raises:
+        ValueError: if the value is a class, a string, or lacks a member of the protocol.
+    """
+    if isinstance(value, type):
+        example = f"jc.{example}"
+        if isinstance(value, protocol):  # a class has the methods of its objects
+            is_ours = value.__module__.split(".")[0] == __name__.split(".")[0]
+            example = f"{'jc.' if is_ours else ''}{value.__name__}()"
+        raise ValueError(
+            f"{name} must be an object, such as {example}, got the class {value.__name__}"
+        )
+    if isinstance(value, str) or not isinstance(value, protocol):
+        quote = textwrap.shorten(repr(value), MAX_QUOTE, placeholder=" ...")
+        raise ValueError(f"{name} must be an object, such as jc.{example}, got {quote}")
