@@ -22,7 +22,7 @@ from jaxcontact.contact import (
 )
 from jaxcontact.control import scenes
 from jaxcontact.control.cost import TrackingCost, contact_force, contact_force_error, contact_time
-from jaxcontact.control.inner_product import l2_value_and_grad
+from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
@@ -131,6 +131,7 @@ __all__ = [
     "contact_force_error",
     "contact_pressure",
     "contact_time",
+    "control_dot",
     "derivative_report",
     "descend",
     "directional_derivative",

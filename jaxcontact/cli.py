@@ -27,7 +27,6 @@ import optax
 from jax import Array
 
 import jaxcontact as jc
-from jaxcontact.control.inner_product import control_dot
 from jaxcontact.optimize import LBFGS, NewtonCG, Optax, SteepestDescent
 from jaxcontact.output.export import write_time_series
 from jaxcontact.output.figures import draw_figures
@@ -180,8 +179,8 @@ def _distance(system: jc.System, dt: float, control: Array, reference: Array) ->
     """Return the relative L2(0,T; L2) distance of a control to the reference."""
     difference = control - reference
     return jnp.sqrt(
-        control_dot(system, dt, difference, difference)
-        / control_dot(system, dt, reference, reference)
+        jc.control_dot(system, dt, difference, difference)
+        / jc.control_dot(system, dt, reference, reference)
     )
 
 

@@ -21,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.control.inner_product import riesz_representative
-from jaxcontact.control.inner_products import InnerProduct, RegionL2, Weighted, lumped_mass
+from jaxcontact.control.inner_product import L2, InnerProduct, RegionL2, Weighted, lumped_mass
 from jaxcontact.system import assembly
 from jaxcontact.system.system import System
 
@@ -75,7 +74,7 @@ class Actuator:
         shape = (values.shape[0], self.n_nodes, self.dimension)
         fields = jnp.zeros(shape, values.dtype).at[:, self.nodes].set(values)
         if self.system is not None:
-            fields = riesz_representative(self.system, 1.0, fields)
+            fields = L2(self.system, 1.0).riesz(fields)
         return fields[self.intervals]
 
     def inner_product(

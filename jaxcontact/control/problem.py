@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxcontact.control.inner_products import InnerProduct
+from jaxcontact.control.inner_product import InnerProduct
 from jaxcontact.motion.checks import SolveError
 
 #: A predicted decrease below this times the value is rounding error.

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.control.inner_products import InnerProduct
+from jaxcontact.control.inner_product import InnerProduct
 from jaxcontact.control.problem import Point, identity, select, value_and_gradient
 from jaxcontact.optimize.driver import check_method, choose_product, make_bounds
 from jaxcontact.optimize.lbfgs import LBFGS

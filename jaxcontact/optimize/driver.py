@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.control.inner_products import L2, InnerProduct, lumped_l2
+from jaxcontact.control.inner_product import L2, InnerProduct, lumped_l2
 from jaxcontact.control.problem import Point, Problem
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.optimize.lbfgs import LBFGS

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.control.inner_products import InnerProduct
+from jaxcontact.control.inner_product import InnerProduct
 from jaxcontact.control.problem import as_partial
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of

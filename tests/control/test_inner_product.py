@@ -5,7 +5,7 @@ import pytest
 from support.bodies import BLOCK, VISCOUS
 
 import jaxcontact as jc
-from jaxcontact.control.inner_product import control_dot, nodal_norms, riesz_representative
+from jaxcontact.control.inner_product import L2, nodal_norms
 
 DT = 0.02
 # The mass solve stops at 1e-14; its matrix has a condition number of about ten.
@@ -29,12 +29,12 @@ def dense(system):
 def test_control_dot_is_the_integral_over_time_and_body(system):
     first, second = random_field(3, 15, 2), random_field(3, 15, 2, seed=1)
     expected = DT * np.einsum("tai,ab,tbi->", first, dense(system), second)
-    np.testing.assert_allclose(control_dot(system, DT, first, second), expected)
+    np.testing.assert_allclose(jc.control_dot(system, DT, first, second), expected)
 
 
 def test_control_dot_of_ones_is_duration_times_area(system):
     ones = jnp.ones((4, 15, 2)) * jnp.array([1.0, 0.0])[None, None, :]
-    np.testing.assert_allclose(control_dot(system, DT, ones, ones), 4 * DT * 2.0)
+    np.testing.assert_allclose(jc.control_dot(system, DT, ones, ones), 4 * DT * 2.0)
 
 
 def test_nodal_norms_are_squared_l2_norms(system):
@@ -43,38 +43,38 @@ def test_nodal_norms_are_squared_l2_norms(system):
     np.testing.assert_allclose(nodal_norms(system.nodal_mass, fields), expected)
 
 
-def test_riesz_representative_represents_the_derivative(system):
+def test_l2_riesz_represents_the_derivative(system):
     derivative, direction = random_field(3, 15, 2), random_field(3, 15, 2, seed=1)
-    gradient = riesz_representative(system, DT, derivative)
-    found = control_dot(system, DT, gradient, direction)
+    gradient = L2(system, DT).riesz(derivative)
+    found = jc.control_dot(system, DT, gradient, direction)
     np.testing.assert_allclose(found, jnp.vdot(derivative, direction), rtol=SOLVE_TOLERANCE)
 
 
-def test_riesz_representative_is_the_dense_solve(system):
+def test_l2_riesz_is_the_dense_solve(system):
     derivative = random_field(3, 15, 2)
     expected = np.linalg.solve(dense(system), np.asarray(derivative)) / DT
-    gradient = riesz_representative(system, DT, derivative)
+    gradient = L2(system, DT).riesz(derivative)
     np.testing.assert_allclose(gradient, expected, atol=SOLVE_TOLERANCE * np.max(expected))
 
 
-def test_riesz_representative_is_accurate_in_steps_of_any_size(system):
+def test_l2_riesz_is_accurate_in_steps_of_any_size(system):
     # Late steps of a long horizon have little influence, but their gradient counts as much.
     derivative = random_field(3, 15, 2) * jnp.array([1.0, 1e-8, 1e-16])[:, None, None]
-    gradient = riesz_representative(system, DT, derivative)
+    gradient = L2(system, DT).riesz(derivative)
     for k in range(3):
         expected = np.linalg.solve(dense(system), np.asarray(derivative[k])) / DT
         error = np.max(np.abs(gradient[k] - expected))
         assert error < 1e-9 * np.max(np.abs(expected)), k
 
 
-def test_riesz_representative_of_zero_is_zero(system):
-    assert not np.any(riesz_representative(system, DT, jnp.zeros((2, 15, 2))))
+def test_l2_riesz_of_zero_is_zero(system):
+    assert not np.any(L2(system, DT).riesz(jnp.zeros((2, 15, 2))))
 
 
-def test_riesz_representative_keeps_float32():
+def test_l2_riesz_keeps_float32():
     single = jc.discretize(jc.Scene(BLOCK, VISCOUS), dtype=jnp.float32)
     derivative = random_field(3, 15, 2).astype(jnp.float32)
-    gradient = riesz_representative(single, DT, derivative)
+    gradient = L2(single, DT).riesz(derivative)
     assert gradient.dtype == jnp.float32
     expected = np.linalg.solve(dense(single), np.asarray(derivative)) / DT
     np.testing.assert_allclose(gradient, expected, atol=1e-4 * np.max(expected))
@@ -83,9 +83,9 @@ def test_riesz_representative_keeps_float32():
 def test_l2_value_and_grad_of_half_the_square_is_the_control_itself(system):
     u = random_field(3, 15, 2)
     value, gradient = jc.l2_value_and_grad(
-        lambda u: 0.5 * control_dot(system, DT, u, u), system, DT
+        lambda u: 0.5 * jc.control_dot(system, DT, u, u), system, DT
     )(u)
-    np.testing.assert_allclose(value, 0.5 * control_dot(system, DT, u, u))
+    np.testing.assert_allclose(value, 0.5 * jc.control_dot(system, DT, u, u))
     np.testing.assert_allclose(gradient, u, atol=SOLVE_TOLERANCE)
 
 

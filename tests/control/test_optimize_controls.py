@@ -8,7 +8,6 @@ import pytest
 from jax.tree_util import Partial
 
 import jaxcontact as jc
-from jaxcontact.control.inner_product import control_dot
 
 STEPS = 7
 DT = 0.1
@@ -58,7 +57,7 @@ def test_actuator_inner_product_is_the_l2_product_of_the_controls(scene, make):
     actuator = make(mesh, system)
     p, q = (random_like(actuator.zeros(), seed) for seed in (0, 1))
     product = actuator.inner_product(system, DT)
-    expected = control_dot(system, DT, actuator(p), actuator(q))
+    expected = jc.control_dot(system, DT, actuator(p), actuator(q))
     assert float(product.dot(p, q)) == pytest.approx(float(expected), rel=1e-12)
 
 
@@ -103,7 +102,7 @@ def test_boundary_actuator_norm_is_the_l2_norm_of_the_traction(scene):
 
 
 def _distance(system, target, u):
-    return 0.5 * control_dot(system, DT, u - target, u - target)
+    return 0.5 * jc.control_dot(system, DT, u - target, u - target)
 
 
 def tracking(system):

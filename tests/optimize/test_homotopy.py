@@ -51,10 +51,7 @@ def test_homotopy_solves_every_relaxed_problem_to_its_tolerance():
             relaxed.objective, problem.stepper.system, problem.options["dt"]
         )(result.state.point.parameters)
         norm = (
-            jc.inner_product.control_dot(
-                problem.stepper.system, problem.options["dt"], gradient, gradient
-            )
-            ** 0.5
+            jc.control_dot(problem.stepper.system, problem.options["dt"], gradient, gradient) ** 0.5
         )
         assert norm < 1e-9 * result.history.gradient_norm[0]
 

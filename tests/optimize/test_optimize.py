@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 from support.optimize_problems import graded_bar, l2_distance, quadratic
 
 import jaxcontact as jc
-from jaxcontact.control.inner_products import Weighted
+from jaxcontact.control.inner_product import Weighted
 
 METHODS = {
     "steepest descent": jc.SteepestDescent(),
@@ -156,9 +156,7 @@ def test_optimize_rejects_steps_to_where_the_objective_is_nan(problem, method):
 
 
 def l2_norm(u, space):
-    from jaxcontact.control.inner_product import control_dot
-
-    return jnp.sqrt(control_dot(space["system"], space["dt"], u, u))
+    return jnp.sqrt(jc.control_dot(space["system"], space["dt"], u, u))
 
 
 def test_optax_that_diverges_returns_the_start(problem):

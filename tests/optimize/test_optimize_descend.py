@@ -10,7 +10,7 @@ from support.kinked import START, grazing
 from support.optimize_problems import quadratic
 
 import jaxcontact as jc
-from jaxcontact.control.inner_products import Weighted
+from jaxcontact.control.inner_product import Weighted
 
 METHODS = [
     jc.SteepestDescent(),

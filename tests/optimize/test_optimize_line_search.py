@@ -7,7 +7,7 @@ import pytest
 from jax.tree_util import Partial
 
 import jaxcontact as jc
-from jaxcontact.control.inner_products import Weighted
+from jaxcontact.control.inner_product import Weighted
 from jaxcontact.optimize.line_search import Trial
 
 EUCLIDEAN = Weighted(jnp.ones(1))

@@ -6,7 +6,7 @@ import pytest
 from jax.tree_util import Partial
 
 import jaxcontact as jc
-from jaxcontact.control.inner_products import Weighted
+from jaxcontact.control.inner_product import Weighted
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
 WEIGHTS = np.linspace(0.5, 4.0, 6)

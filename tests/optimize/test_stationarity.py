@@ -15,7 +15,7 @@ def test_stationarity_without_weak_contact_is_the_gradient_norm():
     u = 0.5 * minimizer(problem)
     certificate = jc.stationarity(problem.objective, u, **problem.options)
     _, gradient = jc.l2_value_and_grad(problem.objective, problem.stepper.system, DT)(u)
-    norm = jc.inner_product.control_dot(problem.stepper.system, DT, gradient, gradient) ** 0.5
+    norm = jc.control_dot(problem.stepper.system, DT, gradient, gradient) ** 0.5
     assert len(certificate.weak_pairs) == 0
     np.testing.assert_allclose(certificate.residual, norm, rtol=ROUNDING)
     np.testing.assert_allclose(certificate.gradient_norm, norm, rtol=ROUNDING)
@@ -54,7 +54,7 @@ def test_stationarity_reports_the_wrong_sign_where_release_is_better():
     assert not certificate.is_strong
     # At least the gradient of the open side remains, along which the value falls.
     _, gradient = jc.l2_value_and_grad(problem.objective, problem.stepper.system, DT)(0.999 * u)
-    norm = jc.inner_product.control_dot(problem.stepper.system, DT, gradient, gradient) ** 0.5
+    norm = jc.control_dot(problem.stepper.system, DT, gradient, gradient) ** 0.5
     np.testing.assert_array_equal(certificate.gap_multiplier, [0.0])
     assert certificate.residual > 0.99 * norm
 
@@ -65,7 +65,7 @@ def test_stationarity_on_the_kink_away_from_the_minimiser_is_the_tangential_grad
     along = jnp.zeros_like(u).at[0, 1, 0].set(u[1, 1, 0]).at[1, 1, 0].set(-u[0, 1, 0])
     certificate = jc.stationarity(problem.objective, u + 0.1 * along, **problem.options)
     system = problem.stepper.system
-    size = 0.1 * problem.alpha * jc.inner_product.control_dot(system, DT, along, along) ** 0.5
+    size = 0.1 * problem.alpha * jc.control_dot(system, DT, along, along) ** 0.5
     assert len(certificate.weak_pairs) == 1
     np.testing.assert_allclose(certificate.residual, size, rtol=1e-6)
 

@@ -36,7 +36,7 @@ class Grazing:
 
     def objective(self, u):
         miss = self.simulate(u).displacement[-1, 1, 0] - self.target
-        control = jc.inner_product.control_dot(self.stepper.system, self.stepper.dt, u, u)
+        control = jc.control_dot(self.stepper.system, self.stepper.dt, u, u)
         return 0.5 * self.weight * miss**2 + 0.5 * self.alpha * control
 
     @property

@@ -6,7 +6,6 @@ import numpy as np
 from jax.tree_util import Partial
 
 import jaxcontact as jc
-from jaxcontact.control.inner_product import control_dot
 
 DURATION = 0.5
 WEIGHT = 0.05
@@ -24,8 +23,8 @@ def graded_bar(n_cells):
 
 def _misfit(system, dt, modes, data, u):
     """J(u) = alpha/2 |u|^2 + 1/2 sum_j ((u, phi_j) - c_j)^2 in L2(0,T; L2)."""
-    products = jnp.stack([control_dot(system, dt, mode, u) for mode in modes])
-    return 0.5 * WEIGHT * control_dot(system, dt, u, u) + 0.5 * jnp.sum((products - data) ** 2)
+    products = jnp.stack([jc.control_dot(system, dt, mode, u) for mode in modes])
+    return 0.5 * WEIGHT * jc.control_dot(system, dt, u, u) + 0.5 * jnp.sum((products - data) ** 2)
 
 
 def quadratic(n_cells=12, steps=8):
@@ -37,7 +36,7 @@ def quadratic(n_cells=12, steps=8):
         for j in range(4)
     ]
     data = jnp.array([1.0, -0.5, 2.0, 0.25])
-    gram = jnp.array([[control_dot(system, dt, a, b) for a in modes] for b in modes])
+    gram = jnp.array([[jc.control_dot(system, dt, a, b) for a in modes] for b in modes])
     # In the span of the modes: alpha a + G a = c.
     coefficients = jnp.linalg.solve(WEIGHT * jnp.eye(4) + gram, data)
     minimiser = sum(a * mode for a, mode in zip(coefficients, modes, strict=True))
@@ -48,7 +47,7 @@ def quadratic(n_cells=12, steps=8):
 
 def l2_distance(first, second, system, dt):
     difference = first - second
-    return float(jnp.sqrt(control_dot(system, dt, difference, difference)))
+    return float(jnp.sqrt(jc.control_dot(system, dt, difference, difference)))
 
 
 def block(tree):
