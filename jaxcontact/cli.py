@@ -171,7 +171,7 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
         figures = {}
     for name, figure in figures.items():
         figure.savefig(output.path(f"{name}.png"), dpi=150)
-    return 130 if result.status.startswith("interrupted") else 0
+    return 130 if result.status is jc.Ending.INTERRUPTED else 0
 
 
 @jax.jit

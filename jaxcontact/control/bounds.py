@@ -11,9 +11,41 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
+#: Lower and upper bound as a user gives them: numbers or arrays that broadcast.
+BoundsLike = tuple[ArrayLike, ArrayLike]
+
+#: Both bounds in the shape of the parameters, or None.
 Bounds = tuple[Array, Array] | None
+
+
+def make_bounds(bounds: BoundsLike | None, start: Array) -> Bounds:
+    """Return both bounds in shape and type of the start.
+
+    Raises:
+        ValueError: if the bounds are no pair, do not fit the start, or cross.
+    """
+    if bounds is None:
+        return None
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError("bounds must be a pair (lower, upper) of numbers or arrays")
+    for bound in bounds:
+        shape = np.shape(bound)
+        fits = all(n in (1, m) for n, m in zip(shape[::-1], start.shape[::-1], strict=False))
+        if len(shape) > start.ndim or not fits:
+            raise ValueError(
+                f"a bound of shape {shape} does not fit what is optimised, {start.shape}"
+            )
+    if not any(isinstance(bound, Tracer) for bound in bounds):
+        n_crossed = int(np.sum(~(np.asarray(bounds[0]) <= np.asarray(bounds[1]))))
+        if n_crossed:
+            raise ValueError(f"{n_crossed} lower bounds are above their upper bounds or NaN")
+    lower, upper = (jnp.broadcast_to(jnp.asarray(b, start.dtype), start.shape) for b in bounds)
+    return lower, upper
 
 
 def free_variables(bounds: Bounds, parameters: Array, derivative: Array) -> Array | None:

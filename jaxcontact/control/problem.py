@@ -10,20 +10,41 @@ representative, so that norms and slopes of gradients cost no product with the m
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxcontact.control.inner_product import InnerProduct
+from jaxcontact.control.bounds import Bounds, BoundsLike, make_bounds
+from jaxcontact.control.inner_product import L2, InnerProduct, lumped_l2
 from jaxcontact.motion.checks import SolveError
+from jaxcontact.system.system import System
+from jaxcontact.transforms.options import check_option
 
 #: A predicted decrease below this times the value is rounding error.
 ROUNDING = 1e-16
+
+R = TypeVar("R")
+
+
+@runtime_checkable
+class ControlMap(Protocol):
+    """Linear map from parameters to controls, a pytree; for instance an `Actuator`."""
+
+    def __call__(self, parameters: Array) -> Array:
+        """Return the control (T, N, d)."""
+        ...
+
+    def inner_product(
+        self, system: System, dt: float | Array, *, is_lumped: bool = False
+    ) -> InnerProduct:
+        """Return the inner product of the parameters, for bounds a diagonal one."""
+        ...
 
 
 class Point(NamedTuple):
@@ -32,8 +53,8 @@ class Point(NamedTuple):
     parameters: Array
     """The point p."""
 
-    value: Any
-    """J(E p), a number, traced a scalar; infinite where the objective is not finite."""
+    value: Array
+    """J(E p), a scalar; infinite where value or gradient are not finite."""
 
     derivative: Array
     """dJ/dp, entry by entry."""
@@ -42,9 +63,120 @@ class Point(NamedTuple):
     """Riesz representative of the derivative."""
 
 
-def select(condition: Array, first: Any, second: Any) -> Any:
-    """Return one of two pytrees of arrays, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+@dataclass
+class Counts:
+    """What was evaluated so far; under a trace, what the program contains."""
+
+    evaluations: int = 0
+    """Evaluations of value and gradient."""
+
+    hessian_products: int = 0
+    """Products with the Hessian."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Objective, control map, inner product and bounds; on the host and under a trace."""
+
+    objective: Callable[[Array], Array]
+    """Maps a control to a scalar. A `jax.tree_util.Partial` of arrays is compiled with its arrays
+    as arguments; any other function runs as it is, since compiling it would bake the arrays it
+    holds into the program."""
+
+    product: InnerProduct
+    """Inner product of the parameters."""
+
+    controls: Callable[[Array], Array]
+    """Linear map from parameters to controls, a pytree."""
+
+    bounds: Bounds
+    """Lower and upper bounds of the parameters, or None."""
+
+    counts: Counts = field(default_factory=Counts)
+    """Work so far; a problem that is made from this one by `dataclasses.replace` adds to it."""
+
+    @classmethod
+    def of(
+        cls,
+        objective: Callable[[Array], Array],
+        start: Array,
+        *,
+        system: System | None = None,
+        dt: float | Array | None = None,
+        bounds: BoundsLike | None = None,
+        controls: ControlMap | Callable[[Array], Array] | None = None,
+        inner_product: InnerProduct | None = None,
+    ) -> Problem:
+        """Return the problem that the arguments of `optimize` state, or say what is wrong.
+
+        Raises:
+            ValueError: if an argument is missing or is not what it should be.
+        """
+        if not callable(objective):
+            raise ValueError(
+                f"the objective must be a function of a control, got {type(objective).__name__}"
+            )
+        if not jnp.issubdtype(start.dtype, jnp.floating):
+            raise ValueError(
+                f"the start must hold floating point numbers, got {start.dtype}; write "
+                "jnp.asarray(u0, float)"
+            )
+        product = inner_product
+        if product is None:
+            product = _product_of(system, dt, controls, is_bounded=bounds is not None)
+        check_option(
+            "inner_product", product, InnerProduct, "control.inner_product.Weighted(weights)"
+        )
+        return cls(
+            objective=as_partial(objective),
+            product=product,
+            controls=Partial(identity) if controls is None else controls,
+            bounds=make_bounds(bounds, start),
+        )
+
+    @cached_property
+    def is_compiled(self) -> bool:
+        """Whether all parts are pytrees, so that their arrays can be arguments of jit."""
+        return all(_is_pytree(part) for part in (self.objective, self.controls, self.product))
+
+    def evaluate(self, parameters: Array) -> Point:
+        """Return the point; its value is infinite if a time step fails or if it is not finite."""
+        self.counts.evaluations += 1
+        evaluate = _evaluate_compiled if self.is_compiled else _evaluate
+        try:
+            value, derivative, gradient, is_finite = evaluate(
+                self.objective, self.controls, self.product, parameters
+            )
+        except SolveError:
+            nothing = jnp.full_like(parameters, jnp.nan)
+            return Point(parameters, jnp.full((), jnp.inf, parameters.dtype), nothing, nothing)
+        value = jnp.where(is_finite, value, jnp.inf)
+        return Point(parameters, value, derivative, gradient)
+
+    def hessian_product(self, parameters: Array, direction: Array) -> Array:
+        """Return the Hessian (one of a semismooth J) times a direction, a covector."""
+        self.counts.hessian_products += 1
+        multiply = _hessian_product_compiled if self.is_compiled else _hessian_product
+        return multiply(self.objective, self.controls, parameters, direction)
+
+    def riesz(self, covector: Array) -> Array:
+        """Return the vector that represents a covector."""
+        return _riesz(self.product, covector)
+
+    def dot(self, first: Array, second: Array) -> Array:
+        """Return the inner product of two vectors, a scalar."""
+        return _dot(self.product, first, second)
+
+    def project(self, parameters: Array) -> Array:
+        """Return the nearest point within the bounds."""
+        return parameters if self.bounds is None else jnp.clip(parameters, *self.bounds)
+
+    def gradient_norm(self, point: Point) -> Array:
+        """Return the stationarity measure, a scalar: |G|, with bounds |p - P(p - G)|."""
+        if self.bounds is None:
+            return jnp.sqrt(jnp.maximum(jnp.vdot(point.derivative, point.gradient), 0.0))
+        step = point.parameters - self.project(point.parameters - point.gradient)
+        return jnp.sqrt(self.dot(step, step))
 
 
 def identity(parameters: Array) -> Array:
@@ -52,89 +184,37 @@ def identity(parameters: Array) -> Array:
     return parameters
 
 
-def as_partial(objective: Callable[[Array], Any]) -> Callable[[Array], Any]:
+def as_partial(function: Callable[[Array], R]) -> Callable[[Array], R]:
     """Return a bound method of a pytree as `Partial`, so that its arrays are arguments of jit."""
-    if inspect.ismethod(objective) and _is_pytree(objective.__self__):
-        return Partial(objective.__func__, objective.__self__)
-    return objective
+    if inspect.ismethod(function) and _is_pytree(function.__self__):
+        return Partial(function.__func__, function.__self__)
+    return function
 
 
-def _is_pytree(value: Any) -> bool:
+def _is_pytree(value: object) -> bool:
     return not jax.tree_util.all_leaves([value])
 
 
-class Problem:
-    """Objective, control map, inner product and bounds, with a count of what was evaluated."""
-
-    def __init__(
-        self,
-        objective: Callable[[Array], Array],
-        product: InnerProduct,
-        *,
-        controls: Any = None,
-        bounds: tuple[Array, Array] | None = None,
-    ):
-        """State the problem.
-
-        Args:
-            objective: maps a control to a scalar. A `jax.tree_util.Partial` of arrays (or a bound
-                method of a pytree) is compiled with its arrays as arguments; any other function
-                runs as it is, since compiling it would bake the arrays it holds into the program.
-            product: inner product of the parameters.
-            controls: linear map from parameters to controls, a pytree; None is the identity.
-            bounds: lower and upper bounds of the parameters.
-        """
-        self.objective = as_partial(objective)
-        self.product = product
-        self.controls = Partial(identity) if controls is None else controls
-        self.bounds = bounds
-        self.evaluations = 0
-        self.hessian_products = 0
-        is_compiled = all(_is_pytree(part) for part in (self.objective, self.controls, product))
-        self._evaluate = _evaluate_compiled if is_compiled else value_and_gradient
-        self._hessian_product = _hessian_product_compiled if is_compiled else _hessian_product
-
-    def evaluate(self, parameters: Array) -> Point:
-        """Return value and gradient; the value is infinite if anything is not finite."""
-        self.evaluations += 1
-        try:
-            value, derivative, gradient, is_finite = self._evaluate(
-                self.objective, self.controls, self.product, parameters
-            )
-        except SolveError:
-            nothing = jnp.full_like(parameters, jnp.nan)
-            return Point(parameters, math.inf, nothing, nothing)
-        return Point(parameters, float(value) if is_finite else math.inf, derivative, gradient)
-
-    def hessian_product(self, parameters: Array, direction: Array) -> Array:
-        """Return the Hessian (one of a semismooth J) times a direction, a covector."""
-        self.hessian_products += 1
-        return self._hessian_product(self.objective, self.controls, parameters, direction)
-
-    def riesz(self, covector: Array) -> Array:
-        """Return the vector that represents a covector."""
-        return _riesz(self.product, covector)
-
-    def dot(self, first: Array, second: Array) -> float:
-        """Return the inner product of two vectors."""
-        return float(_dot(self.product, first, second))
-
-    def project(self, parameters: Array) -> Array:
-        """Return the nearest point within the bounds."""
-        return parameters if self.bounds is None else jnp.clip(parameters, *self.bounds)
-
-    def gradient_norm(self, point: Point) -> float:
-        """Return the stationarity measure: |G|, with bounds |p - P(p - G)|."""
-        if self.bounds is None:
-            return math.sqrt(max(float(jnp.vdot(point.derivative, point.gradient)), 0.0))
-        step = point.parameters - self.project(point.parameters - point.gradient)
-        return math.sqrt(self.dot(step, step))
+def _product_of(
+    system: System | None,
+    dt: float | Array | None,
+    controls: ControlMap | Callable[[Array], Array] | None,
+    *,
+    is_bounded: bool,
+) -> InnerProduct:
+    """Return the inner product that follows from the scene and the control map."""
+    if system is None or dt is None:
+        raise ValueError(
+            "an optimisation needs system= and dt=, or an inner_product=, to measure steps in"
+        )
+    if controls is None:
+        return lumped_l2(system, dt) if is_bounded else L2(system, dt)
+    check_option("controls", controls, ControlMap, "actuator(system, steps)")
+    return cast(ControlMap, controls).inner_product(system, dt, is_lumped=is_bounded)
 
 
-def value_and_gradient(
-    objective: Any, controls: Any, product: InnerProduct, parameters: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return value, derivative, gradient, and whether all of them are finite; traceable."""
+def _evaluate(objective, controls, product, parameters):
+    """Return value, derivative, gradient, and whether all of them are finite."""
     value, derivative = jax.value_and_grad(lambda p: objective(controls(p)))(parameters)
     gradient = product.riesz(derivative)
     is_finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
@@ -157,5 +237,5 @@ def _riesz(product, covector):
 
 
 # Module-level, so that a second optimisation of the same problem compiles nothing.
-_evaluate_compiled = jax.jit(value_and_gradient)
+_evaluate_compiled = jax.jit(_evaluate)
 _hessian_product_compiled = jax.jit(_hessian_product)

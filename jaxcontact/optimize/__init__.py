@@ -7,6 +7,7 @@ from jaxcontact.optimize.driver import optimize
 from jaxcontact.optimize.homotopy import Homotopy
 from jaxcontact.optimize.lbfgs import LBFGS
 from jaxcontact.optimize.line_search import WeakWolfe
+from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG
 from jaxcontact.optimize.optax_method import Optax
 from jaxcontact.optimize.result import History, Result, load_result
@@ -17,6 +18,7 @@ __all__ = [
     "LBFGS",
     "Actuator",
     "Descent",
+    "Ending",
     "History",
     "Homotopy",
     "NewtonCG",

@@ -132,8 +132,8 @@ def certify(
     gradient = problem.riesz(derivative)
     step = parameters - problem.project(parameters - gradient)
     return Stationarity(
-        residual=math.hypot(math.sqrt(max(problem.dot(step, step), 0.0)), excess),
-        gradient_norm=problem.gradient_norm(problem.evaluate(parameters)),
+        residual=math.hypot(math.sqrt(max(float(problem.dot(step, step)), 0.0)), excess),
+        gradient_norm=float(problem.gradient_norm(problem.evaluate(parameters))),
         weak_pairs=pairs,
         gap_multiplier=multiplier,
         impulse_multiplier=by_impulse - compliance.T @ multiplier,

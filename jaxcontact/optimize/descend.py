@@ -1,26 +1,26 @@
 """Optimisation as one pure function: many starts, or many problems, under `jax.vmap`.
 
 `optimize` decides between its steps on the host: it can be interrupted, restarted and watched.
-Here the same steps run in `lax.scan`, so that the whole optimisation can be transformed. Methods
-that can do this have a `traced_step`, equal to their `step` up to rounding; a test holds the two
-together.
+Here the same steps run in `lax.scan`, so that the whole optimisation can be transformed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.control.bounds import BoundsLike
 from jaxcontact.control.inner_product import InnerProduct
-from jaxcontact.control.problem import Point, identity, select, value_and_gradient
-from jaxcontact.optimize.driver import check_method, choose_product, make_bounds
-from jaxcontact.optimize.lbfgs import LBFGS
+from jaxcontact.control.problem import ControlMap, Point, Problem
+from jaxcontact.optimize.driver import choose_method
+from jaxcontact.optimize.method import Method, MethodState
 from jaxcontact.system.system import System
+from jaxcontact.transforms.loops import select
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -48,42 +48,20 @@ class Descent:
     """Iterations until the method found no better point, scalar int32; else K."""
 
 
-class TracedProblem(NamedTuple):
-    """The reduced problem as a traced step sees it."""
+class Course(NamedTuple):
+    """What the scan over the iterations carries."""
 
-    objective: Callable[[Array], Array]
-    """Maps a control to a scalar."""
+    state: MethodState
+    """State of the method."""
 
-    controls: Callable[[Array], Array]
-    """Linear map from parameters to controls."""
+    best: Point
+    """Point with the lowest value so far."""
 
-    product: InnerProduct
-    """Inner product of the parameters."""
+    is_running: Array
+    """Whether the method has always found a next point, bool."""
 
-    bounds: tuple[Array, Array] | None
-    """Lower and upper bounds of the parameters."""
-
-    def evaluate(self, parameters: Array) -> Point:
-        """Return value and gradient; the value is infinite if anything is not finite."""
-        value, derivative, gradient, is_finite = value_and_gradient(
-            self.objective, self.controls, self.product, parameters
-        )
-        return Point(parameters, jnp.where(is_finite, value, jnp.inf), derivative, gradient)
-
-    def dot(self, first: Array, second: Array) -> Array:
-        """Return the inner product of two vectors."""
-        return self.product.dot(first, second)
-
-    def project(self, parameters: Array) -> Array:
-        """Return the nearest point within the bounds."""
-        return parameters if self.bounds is None else jnp.clip(parameters, *self.bounds)
-
-    def gradient_norm(self, point: Point) -> Array:
-        """Return the stationarity measure: |G|, with bounds |p - P(p - G)|."""
-        if self.bounds is None:
-            return jnp.sqrt(jnp.maximum(jnp.vdot(point.derivative, point.gradient), 0.0))
-        step = point.parameters - self.project(point.parameters - point.gradient)
-        return jnp.sqrt(self.dot(step, step))
+    iterations: Array
+    """Number of iterations so far, int32."""
 
 
 @in_full_precision
@@ -91,11 +69,11 @@ def descend(
     objective: Callable[[Array], Array],
     u0: Array,
     *,
-    method: Any = None,
+    method: Method | None = None,
     system: System | None = None,
     dt: float | Array | None = None,
-    bounds: tuple[Any, Any] | None = None,
-    controls: Any = None,
+    bounds: BoundsLike | None = None,
+    controls: ControlMap | Callable[[Array], Array] | None = None,
     inner_product: InnerProduct | None = None,
     iterations: int = 200,
 ) -> Descent:
@@ -129,49 +107,45 @@ def descend(
         The best control with the values of all iterations.
 
     Raises:
-        ValueError: if the method has no traced step, or arguments do not fit, see `optimize`.
+        ValueError: if the method cannot be traced, or arguments do not fit, see `optimize`.
     """
-    method = LBFGS() if method is None else method
-    check_method(method)
-    if not hasattr(method, "traced_step"):
+    method = choose_method(method)
+    if not method.is_traceable:
         raise ValueError(
             f"{type(method).__name__} decides on the host and cannot be traced; take "
             "jc.SteepestDescent(), jc.LBFGS() or jc.Optax(...), or call jc.optimize for each start"
         )
     start = jnp.asarray(u0)
-    problem = TracedProblem(
+    problem = Problem.of(
         objective,
-        identity if controls is None else controls,
-        choose_product(inner_product, controls, system, dt, is_bounded=bounds is not None),
-        make_bounds(bounds, start),
+        start,
+        system=system,
+        dt=dt,
+        bounds=bounds,
+        controls=controls,
+        inner_product=inner_product,
     )
 
-    def advance(carry, _):
-        state, best, is_running, count = carry
-        new, is_found = method.traced_step(problem, state)
-        is_found = is_found & is_running
-        state = select(is_found, new, state)
-        best = select(state.point.value < best.value, state.point, best)
-        record = state.point.value, problem.gradient_norm(state.point)
-        return (state, best, is_found, count + is_found), record
+    def advance(course: Course, _: None) -> tuple[Course, tuple[Array, Array]]:
+        new, ending = method.step(problem, course.state)
+        is_found = course.is_running & ~cast(Array, ending)
+        state = select(is_found, new, course.state)
+        point = state.point
+        best = select(point.value < course.best.value, point, course.best)
+        following = Course(state, best, is_found, course.iterations + is_found)
+        return following, (point.value, problem.gradient_norm(point))
 
     first = problem.evaluate(problem.project(start))
-    state = jax.tree.map(lambda leaf: _as_array(leaf, start.dtype), method.init(problem, first))
-    (_, best, _, count), (values, norms) = jax.lax.scan(
-        advance, (state, first, jnp.bool_(True), jnp.int32(0)), length=iterations
+    state = jax.tree.map(jnp.asarray, method.init(problem, first))
+    course, (values, norms) = jax.lax.scan(
+        advance, Course(state, first, jnp.bool_(True), jnp.int32(0)), length=iterations
     )
+    best = course.best
     return Descent(
         control=problem.controls(best.parameters),
         parameters=best.parameters,
         value=best.value,
         values=jnp.concatenate([first.value[None], values]),
         gradient_norms=jnp.concatenate([problem.gradient_norm(first)[None], norms]),
-        iterations=count,
+        iterations=course.iterations,
     )
-
-
-def _as_array(leaf: Any, dtype: Any) -> Array:
-    """Return a leaf of a state as an array whose type does not change from step to step."""
-    if isinstance(leaf, float):
-        return jnp.asarray(leaf, dtype)
-    return jnp.asarray(leaf, jnp.int32) if isinstance(leaf, int) else jnp.asarray(leaf)

@@ -5,38 +5,59 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, Protocol
+from dataclasses import astuple, replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
-from jaxcontact.control.inner_product import L2, InnerProduct, lumped_l2
-from jaxcontact.control.problem import Point, Problem
+from jaxcontact.control.bounds import BoundsLike
+from jaxcontact.control.inner_product import InnerProduct
+from jaxcontact.control.problem import ControlMap, Point, Problem
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.optimize.lbfgs import LBFGS
-from jaxcontact.optimize.progress import progress_bar
+from jaxcontact.optimize.method import Ending, Method, MethodState
+from jaxcontact.optimize.progress import ProgressBar, progress_bar
 from jaxcontact.optimize.result import History, Result, rebuild_state
 from jaxcontact.system.system import System
+from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
 
+#: Called with iteration, control, value and gradient norm.
+Callback = Callable[[int, Array, float, float], None]
 
-class Method(Protocol):
-    """An optimisation method: an option object with a pure step.
 
-    A state is a tuple with a field `point`; its leaves are arrays and Python numbers whose shapes
-    and types never change, so that it can be kept in a file.
-    """
+class Row(NamedTuple):
+    """One entry of each column of a `History`."""
 
-    def init(self, problem: Problem, point: Point) -> Any:
-        """Return the state at the start."""
-        ...
+    value: float
+    gradient_norm: float
+    evaluations: int
+    hessian_products: int
+    seconds: float
 
-    def step(self, problem: Problem, state: Any) -> tuple[Any, str | None]:
-        """Return the next state, and in words why it is the last one or None."""
-        ...
+
+class Run(NamedTuple):
+    """The optimisation so far; replaced as a whole: an interrupt meets no half of an iteration."""
+
+    state: MethodState
+    """State of the method."""
+
+    best: Point
+    """Point with the lowest value; the derivatives are void if it comes from a file."""
+
+    rows: tuple[Row, ...]
+    """The history; row 0 is the start."""
+
+    def advanced(self, state: MethodState, row: Row) -> Run:
+        """Return the run with one more iteration."""
+        best = state.point if state.point.value < self.best.value else self.best
+        return Run(state, best, (*self.rows, row))
+
+    def is_below(self, tolerance: float) -> bool:
+        """Return whether the gradient norm has fallen to this fraction of the first one."""
+        return self.rows[-1].gradient_norm <= tolerance * self.rows[0].gradient_norm
 
 
 @in_full_precision
@@ -47,18 +68,19 @@ def optimize(
     method: Method | None = None,
     system: System | None = None,
     dt: float | Array | None = None,
-    bounds: tuple[Any, Any] | None = None,
-    controls: Any = None,
+    bounds: BoundsLike | None = None,
+    controls: ControlMap | Callable[[Array], Array] | None = None,
     inner_product: InnerProduct | None = None,
     iterations: int = 200,
     tolerance: float = 0.0,
     progress: bool = False,
-    callback: Callable[[int, Array, float, float], None] | None = None,
+    callback: Callback | None = None,
 ) -> Result:
     """Minimise an objective over controls in the inner product of L2(0,T; L2).
 
-    Ctrl-C ends the run and returns the best iterate so far. The result is never worse than the
-    start (projected to the bounds, if there are any).
+    The result is never worse than the start (projected to the bounds, if there are any). Once the
+    start is evaluated no work is lost: Ctrl-C ends the run and returns the best iterate so far,
+    and an error, for instance in the callback, carries the same as its attribute `result`.
 
     Args:
         objective: maps a control (T, N, d) to a scalar, differentiable by JAX. A bound method of
@@ -74,90 +96,139 @@ def optimize(
         controls: linear map from parameters to controls, for instance an `Actuator`.
         inner_product: used instead of the one of system and dt, see `InnerProduct`.
         iterations: number of (further) iterations.
-        tolerance: stop when the gradient norm is below this times the one at the start.
+        tolerance: stop when the gradient norm is at most this times the one at the start.
         progress: show a progress bar.
         callback: called after every iteration, and at the start, with the iteration, the control
             (T, N, d), the value and the gradient norm.
 
     Returns:
-        The best control with its value, the history, and in words why the run ended.
+        The best control with its value, the history, and why the run ended, see `Ending`.
 
     Raises:
         ValueError: if the objective is not finite at the start, shapes do not fit, bounds cross,
             or a result cannot be continued.
         ImportError: if a progress bar is asked for and the extra `progress` is not installed.
     """
-    method = LBFGS() if method is None else method
-    check_method(method)
+    method = choose_method(method)
     if iterations < 0:
         raise ValueError(f"iterations must not be negative, got {iterations}")
     start = jnp.asarray(u0.parameters if isinstance(u0, Result) else u0)
     start = jnp.asarray(start, start.dtype)  # a weak type would compile everything twice
-    problem = state_problem(objective, start, system, dt, bounds, controls, inner_product)
-    name = type(method).__name__
+    problem = Problem.of(
+        objective,
+        start,
+        system=system,
+        dt=dt,
+        bounds=bounds,
+        controls=controls,
+        inner_product=inner_product,
+    )
+    begin = time.perf_counter()
     if isinstance(u0, Result):
-        unknown = Point(start, 0.0, start, start)
-        state = rebuild_state(method.init(problem, unknown), u0, name)
-        _check_same_problem(problem, state.point)
-        recorder = Recorder(problem, u0.history)
-        best = min(unknown._replace(value=u0.value), state.point, key=_value)
+        try:
+            run = _continued(problem, method, start, u0)
+        except KeyboardInterrupt:
+            return replace(u0, status=Ending.INTERRUPTED)
+        begin -= run.rows[-1].seconds
     else:
-        best = problem.evaluate(problem.project(start))
-        if not math.isfinite(best.value):
-            raise ValueError(
-                "the objective or its gradient is not finite at the start; check the control, the "
-                "target and the time step with jc.simulate"
-            )
-        state = method.init(problem, best)
-        recorder = Recorder(problem)
+        run = _started(problem, method, start, begin)
 
-    bar = progress_bar(iterations) if progress else None
-    status = f"stopped after {iterations} iterations"
+    def result(status: Ending, stationarity: Stationarity | None = None) -> Result:
+        best = run.best
+        return Result(
+            control=problem.controls(best.parameters),
+            parameters=best.parameters,
+            value=float(best.value),
+            history=History(*(np.array(column) for column in zip(*run.rows, strict=True))),
+            status=status,
+            stationarity=stationarity,
+            method=type(method).__name__,
+            state=run.state,
+        )
+
+    bar, status = None, Ending.STOPPED
     try:
-        if not recorder.rows:
-            recorder.add(state.point)
-            _report(recorder, problem, state.point, bar, callback)
+        bar = progress_bar(iterations) if progress else None
+        if not isinstance(u0, Result):
+            _report(problem, run, bar, callback)
         for _ in range(iterations):
-            if recorder.is_below(tolerance):
+            if run.is_below(tolerance):
                 break
-            new_state, failure = method.step(problem, state)
-            if failure is not None:
-                status = failure
+            state, ending = method.step(problem, run.state)
+            if ending is not None:
+                status = Ending(ending)
                 break
-            best = min(best, new_state.point, key=_value)
-            recorder.add(new_state.point)
-            state = new_state
-            _report(recorder, problem, state.point, bar, callback)
-        if recorder.is_below(tolerance):
-            share = f"at most {tolerance:g} of the first one" if tolerance else "zero"
-            status = f"converged: the gradient norm is {share}"
+            run = run.advanced(state, _row(problem, state.point, begin))
+            _report(problem, run, bar, callback)
+        if run.is_below(tolerance):
+            status = Ending.CONVERGED
     except KeyboardInterrupt:
-        status = f"interrupted after {recorder.iterations} iterations; this is the best one"
+        status = Ending.INTERRUPTED
+    except Exception as error:
+        vars(error)["result"] = result(Ending.FAILED)
+        error.add_note("the optimisation so far is not lost: it is the attribute `result` of this")
+        raise
     finally:
         if bar is not None:
             bar.close()
-    return Result(
-        control=problem.controls(best.parameters),
-        parameters=best.parameters,
-        value=best.value,
-        history=recorder.history(),
-        status=status,
-        stationarity=_certificate(problem, best.parameters),
-        method=name,
-        state=state,
-    )
+    try:
+        return result(status, _certificate(problem, run.best.parameters))
+    except KeyboardInterrupt:
+        return result(Ending.INTERRUPTED)
 
 
-def _check_same_problem(problem: Problem, point: Point) -> None:
-    """Raise a ValueError if the objective has another value at a point than was saved."""
-    value = problem.evaluate(point.parameters).value
-    # On another machine the value differs by rounding, which contact amplifies.
-    if not abs(value - point.value) <= 1e-6 * abs(point.value) + np.finfo(float).tiny:
+def choose_method(method: Method | None) -> Method:
+    """Return the method or the default.
+
+    Raises:
+        ValueError: if it is no method.
+    """
+    method = LBFGS() if method is None else method
+    check_option("method", method, Method, "LBFGS()")
+    return method
+
+
+def _started(problem: Problem, method: Method, start: Array, begin: float) -> Run:
+    """Return the run at its start."""
+    point = problem.evaluate(problem.project(start))
+    if not math.isfinite(point.value):
         raise ValueError(
-            f"the saved result has the value {point.value:.9g} where this objective has "
-            f"{value:.9g}: it belongs to another problem. To start from it, hand over "
-            "result.parameters"
+            "the objective or its gradient is not finite at the start; check the control, the "
+            "target and the time step with jc.simulate"
         )
+    return Run(method.init(problem, point), point, (_row(problem, point, begin),))
+
+
+def _continued(problem: Problem, method: Method, start: Array, earlier: Result) -> Run:
+    """Return the run that ended with an earlier result."""
+    unknown = Point(start, jnp.zeros((), start.dtype), start, start)
+    state = rebuild_state(method.init(problem, unknown), earlier, type(method).__name__)
+    point = state.point
+    value, saved = float(problem.evaluate(point.parameters).value), float(point.value)
+    # On another machine the value differs by rounding, which contact amplifies.
+    if not abs(value - saved) <= 1e-6 * abs(saved) + np.finfo(float).tiny:
+        raise ValueError(
+            f"the saved result has the value {saved:.9g} where this objective has {value:.9g}: it "
+            "belongs to another problem. To start from it, hand over result.parameters"
+        )
+    columns = (column.tolist() for column in astuple(earlier.history))
+    rows = tuple(map(Row, *columns))
+    # Checking the result was no work of the run.
+    counts = problem.counts
+    counts.evaluations, counts.hessian_products = rows[-1].evaluations, rows[-1].hessian_products
+    best = unknown._replace(value=jnp.asarray(earlier.value, point.value.dtype))
+    return Run(state, point if point.value < best.value else best, rows)
+
+
+def _row(problem: Problem, point: Point, begin: float) -> Row:
+    counts = problem.counts
+    return Row(
+        value=float(point.value),
+        gradient_norm=float(problem.gradient_norm(point)),
+        evaluations=counts.evaluations,
+        hessian_products=counts.hessian_products,
+        seconds=time.perf_counter() - begin,
+    )
 
 
 def _certificate(problem: Problem, parameters: Array) -> Stationarity | None:
@@ -165,110 +236,16 @@ def _certificate(problem: Problem, parameters: Array) -> Stationarity | None:
     motion = motion_of(problem)
     try:
         return None if motion is None else certify(problem, parameters, motion)
-    except ValueError:
+    except (ValueError, RuntimeError):  # weak contact everywhere, a failed step, no memory left
         return None
 
 
-def state_problem(
-    objective: Callable[[Array], Array],
-    start: Array,
-    system: System | None,
-    dt: float | Array | None,
-    bounds: tuple[Any, Any] | None,
-    controls: Any,
-    inner_product: InnerProduct | None,
-) -> Problem:
-    """Return the problem that the arguments of `optimize` state."""
-    product = choose_product(inner_product, controls, system, dt, is_bounded=bounds is not None)
-    return Problem(objective, product, controls=controls, bounds=make_bounds(bounds, start))
-
-
-def _value(point: Point) -> float:
-    return point.value
-
-
-class Recorder:
-    """Collects the history, also over a restart."""
-
-    def __init__(self, problem: Problem, earlier: History | None = None):
-        """Start a history, or go on with an earlier one."""
-        self.problem = problem
-        self.rows: list[tuple] = []
-        if earlier is not None:
-            columns = [getattr(earlier, field.name).tolist() for field in fields(History)]
-            self.rows = list(zip(*columns, strict=True))
-            problem.evaluations, problem.hessian_products = self.rows[-1][2:4]
-        self.begin = time.perf_counter() - (self.rows[-1][-1] if self.rows else 0.0)
-
-    @property
-    def iterations(self) -> int:
-        """Number of finished iterations."""
-        return len(self.rows) - 1
-
-    def add(self, point: Point) -> None:
-        """Record an iteration."""
-        problem = self.problem
-        norm, seconds = problem.gradient_norm(point), time.perf_counter() - self.begin
-        self.rows.append(
-            (point.value, norm, problem.evaluations, problem.hessian_products, seconds)
-        )
-
-    def is_below(self, tolerance: float) -> bool:
-        """Return whether the gradient norm has fallen to this fraction of the first one."""
-        return self.rows[-1][1] <= tolerance * self.rows[0][1]
-
-    def history(self) -> History:
-        """Return the history so far."""
-        return History(*(np.array(column) for column in zip(*self.rows, strict=True)))
-
-
-def _report(recorder: Recorder, problem: Problem, point: Point, bar: Any, callback: Any) -> None:
-    value, norm = recorder.rows[-1][:2]
+def _report(problem: Problem, run: Run, bar: ProgressBar | None, callback: Callback | None) -> None:
+    iteration, row = len(run.rows) - 1, run.rows[-1]
     if bar is not None:
-        bar.set_postfix_str(f"value {value:.6g}, gradient norm {norm:.2e}", refresh=False)
-        bar.update(1 if recorder.iterations else 0)
+        text = f"value {row.value:.6g}, gradient norm {row.gradient_norm:.2e}"
+        bar.set_postfix_str(text, refresh=False)
+        bar.update(1 if iteration else 0)
     if callback is not None:
-        callback(recorder.iterations, problem.controls(point.parameters), value, norm)
-
-
-def check_method(method: Any) -> None:
-    """Raise a ValueError if a method is a class or a name instead of an object."""
-    if isinstance(method, type | str) or not hasattr(method, "step"):
-        name = method.__name__ if isinstance(method, type) else "LBFGS"
-        raise ValueError(f"method must be an object, such as jc.{name}(), got {method!r}")
-
-
-def choose_product(
-    product: InnerProduct | None, controls: Any, system: Any, dt: Any, *, is_bounded: bool
-) -> InnerProduct:
-    """Return the inner product that the arguments of `optimize` name."""
-    if product is not None:
-        return product
-    if system is None or dt is None:
-        raise ValueError(
-            "optimize needs system= and dt=, or an inner_product=, to measure steps in"
-        )
-    if controls is not None:
-        return controls.inner_product(system, dt, is_lumped=is_bounded)
-    return lumped_l2(system, dt) if is_bounded else L2(system, dt)
-
-
-def make_bounds(bounds: tuple[Any, Any] | None, start: Array) -> tuple[Array, Array] | None:
-    """Return both bounds in the shape of the start."""
-    if bounds is None:
-        return None
-    if len(bounds) != 2:
-        raise ValueError("bounds must be a pair (lower, upper) of numbers or arrays")
-    for bound in bounds:
-        shape = np.shape(bound)
-        fits = all(n in (1, m) for n, m in zip(shape[::-1], start.shape[::-1], strict=False))
-        if len(shape) > start.ndim or not fits:
-            raise ValueError(
-                f"a bound of shape {shape} does not fit what is optimised, {start.shape}"
-            )
-    if not any(isinstance(bound, Tracer) for bound in bounds):
-        n_crossed = int(np.sum(~(np.asarray(bounds[0]) <= np.asarray(bounds[1]))))
-        if n_crossed:
-            raise ValueError(f"{n_crossed} lower bounds are above their upper bounds or NaN")
-    lower, upper = (jnp.broadcast_to(jnp.asarray(b, start.dtype), start.shape) for b in bounds)
-    return lower, upper
+        control = problem.controls(run.state.point.parameters)
+        callback(iteration, control, row.value, row.gradient_norm)

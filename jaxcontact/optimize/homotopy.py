@@ -11,11 +11,12 @@ the exact problem stall at kinks. Source: MATH.md 5.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NamedTuple
 
 from jaxcontact.contact.relaxed import RelaxedContact, with_contact
 from jaxcontact.control.problem import Point, Problem
+from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
@@ -81,18 +82,18 @@ class Homotopy:
     newton: NewtonCG = field(default_factory=lambda: NewtonCG(max_products=300))
     """Solver of the relaxed problems."""
 
+    is_traceable: ClassVar[bool] = False
+    """Each relaxed problem takes as many steps as it needs, decided on the host."""
+
     def init(self, problem: Problem, point: Point) -> HomotopyState:
         """Return the state at the start."""
-        norm = problem.gradient_norm(point)
+        norm = float(problem.gradient_norm(point))
         return HomotopyState(point, 0, 0.0, math.inf, norm, norm)
 
-    def step(self, problem: Problem, state: HomotopyState) -> tuple[HomotopyState, str | None]:
-        """Return the state after the next kappa, or the same one and why it is the last."""
+    def step(self, problem: Problem, state: HomotopyState) -> tuple[HomotopyState, Ending | None]:
+        """Return the state after the next kappa, or why it is the last."""
         if state.level == self.levels:
-            return state, (
-                f"the relaxation ended at kappa = {state.kappa:.1e} J with a relaxed gradient of "
-                f"{state.norm / (state.first_norm or 1.0):.1e} of the first one"
-            )
+            return state, Ending.RELAXED
         kappa = self.reduction * state.kappa if state.level else self.first_kappa
         if kappa is None:
             kappa, relaxed, start = _first_relaxation(problem, state.point)
@@ -100,28 +101,26 @@ class Homotopy:
             relaxed = _relax(problem, kappa)
             start = relaxed.evaluate(state.point.parameters)
         if not math.isfinite(start.value):
-            _count(problem, relaxed)
-            return state, f"the relaxed objective is not finite at kappa = {kappa:.1e} J"
+            return state, Ending.RELAXED_NOT_FINITE
         # Before touch the exact gradient can be zero where the relaxed one is not.
-        first_norm = state.first_norm or relaxed.gradient_norm(start)
+        first_norm = state.first_norm or float(relaxed.gradient_norm(start))
         inner = NewtonCGState(start, state.radius, first_norm)
         for _ in range(self.max_steps):
             if relaxed.gradient_norm(inner.point) <= self.tolerance * first_norm:
                 break
-            following, failure = self.newton.step(relaxed, inner)
-            if failure is not None:
+            following, ending = self.newton.step(relaxed, inner)
+            if ending is not None:
                 following = _newton_step(relaxed, inner)
             if following is None:
                 break
             inner = following
-        _count(problem, relaxed)
         return HomotopyState(
             point=problem.evaluate(inner.point.parameters),
             level=state.level + 1,
             kappa=kappa,
             radius=inner.radius,
             first_norm=first_norm,
-            norm=relaxed.gradient_norm(inner.point),
+            norm=float(relaxed.gradient_norm(inner.point)),
         ), None
 
 
@@ -151,19 +150,8 @@ def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None
 
 
 def _relax(problem: Problem, kappa: float) -> Problem:
-    """Return the problem with relaxed contact."""
-    return Problem(
-        with_contact(problem.objective, RelaxedContact(kappa)),
-        problem.product,
-        controls=problem.controls,
-        bounds=problem.bounds,
-    )
-
-
-def _count(problem: Problem, relaxed: Problem) -> None:
-    """Count the work on a relaxed problem as work on the problem."""
-    problem.evaluations += relaxed.evaluations
-    problem.hessian_products += relaxed.hessian_products
+    """Return the problem with relaxed contact; what it evaluates counts for both."""
+    return replace(problem, objective=with_contact(problem.objective, RelaxedContact(kappa)))
 
 
 def _first_relaxation(problem: Problem, point: Point) -> tuple[float, Problem, Point]:
@@ -171,19 +159,16 @@ def _first_relaxation(problem: Problem, point: Point) -> tuple[float, Problem, P
 
     With it come the relaxed problem and its point at the start.
     """
-    kappa = 1.0
-    relaxed = _relax(problem, kappa)
+    kappa, value = 1.0, float(point.value)
     for _ in range(MAX_TRIALS):
+        relaxed = _relax(problem, kappa)
         start = relaxed.evaluate(point.parameters)
-        change = abs(start.value - point.value) / max(abs(point.value), 1e-300)
+        change = abs(float(start.value) - value) / max(abs(value), 1e-300)
         factor = FIRST_CHANGE / max(change, 1e-300) if math.isfinite(change) else 0.0
         if 0.2 <= factor <= 5.0:
             return kappa, relaxed, start
         # The change is about proportional to kappa, unless rounding or overflow hides it.
         kappa *= min(max(factor, 1e-6), 1e6)
-        evaluations = relaxed.evaluations
-        relaxed = _relax(problem, kappa)
-        relaxed.evaluations = evaluations
     raise ValueError(
         "no relaxation of contact changes the objective at the start by a fraction of it; is there "
         "any contact, and is the value at the start not zero? Otherwise give first_kappa"

@@ -10,17 +10,18 @@ Source: Nocedal and Wright, Numerical Optimization, Algorithm 7.4; Lewis and Ove
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.control.bounds import free_variables, mask, move
-from jaxcontact.control.problem import Point, Problem, select
+from jaxcontact.control.problem import Point, Problem
 from jaxcontact.optimize.line_search import Trial, WeakWolfe
+from jaxcontact.optimize.method import Ending, Outcome, outcome
+from jaxcontact.transforms.loops import cond, select, while_loop
 
 
 class LBFGSState(NamedTuple):
@@ -35,11 +36,11 @@ class LBFGSState(NamedTuple):
     changes: Array
     """y_i, differences of the derivatives, (m, ...)."""
 
-    scale: Any
-    """gamma of the first matrix, a number, traced a scalar."""
+    scale: Array
+    """gamma of the first matrix, a scalar."""
 
-    count: Any
-    """Pairs in the memory, a number, traced a scalar."""
+    count: Array
+    """Pairs in the memory, int32."""
 
 
 @dataclass(frozen=True)
@@ -55,107 +56,72 @@ class LBFGS:
     first_step: float = 1.0
     """The first trial step is this times the negative gradient."""
 
+    is_traceable: ClassVar[bool] = True
+    """Whether `descend` can trace it."""
+
     def init(self, problem: Problem, point: Point) -> LBFGSState:
         """Return the state at the start."""
         del problem
-        return self._forget(point)
+        return self._without_memory(point)
 
-    def _forget(self, point: Point) -> LBFGSState:
-        nothing = jnp.zeros((self.memory, *point.parameters.shape), point.parameters.dtype)
-        return LBFGSState(point, nothing, nothing, self.first_step, 0)
+    def _without_memory(self, point: Point) -> LBFGSState:
+        dtype = point.parameters.dtype
+        nothing = jnp.zeros((self.memory, *point.parameters.shape), dtype)
+        scale = jnp.asarray(self.first_step, dtype)
+        return LBFGSState(point, nothing, nothing, scale, jnp.int32(0))
 
-    def step(self, problem: Problem, state: LBFGSState) -> tuple[LBFGSState, str | None]:
-        """Return the next state, or the same one and the reason why there is none."""
-        new_state = self._try(problem, state)
-        if new_state is None and state.count > 0:
-            new_state = self._try(problem, self._forget(state.point))
-        if new_state is None:
-            return state, "the line search found no lower value; this is a kink or a minimum"
-        return new_state, None
+    def step(self, problem: Problem, state: LBFGSState) -> tuple[LBFGSState, Outcome]:
+        """Return the state after a line search, if need be a second one without the memory."""
 
-    def _try(self, problem: Problem, state: LBFGSState) -> LBFGSState | None:
-        point = state.point
-        free = free_variables(problem.bounds, point.parameters, point.derivative)
-        direction, slope = _direction(
-            problem.product, point.derivative, state.steps, state.changes, state.scale, free
-        )
-        if not (math.isfinite(slope) and slope < 0.0):
-            return None
+        def is_searching(carry: tuple[LBFGSState, Array, Array]) -> Array:
+            state, is_found, searches = carry
+            return ~is_found & ((searches == 0) | ((searches == 1) & (state.count > 0)))
 
-        def along(t: float) -> Trial:
-            target, tangent = move(problem.bounds, point.parameters, direction, t)
-            trial = problem.evaluate(target)
-            return Trial(trial.value, float(jnp.vdot(trial.derivative, tangent)), trial)
-
-        found = self.line_search.search(along, point.value, float(slope))
-        return None if found is None else self._remember(state, found[1].point)
-
-    def _remember(self, state: LBFGSState, point: Point) -> LBFGSState:
-        s = point.parameters - state.point.parameters
-        y = point.derivative - state.point.derivative
-        change = point.gradient - state.point.gradient
-        curvature, size = float(jnp.vdot(s, y)), float(jnp.vdot(y, change))
-        # A pair without curvature would make the matrix indefinite; the search gave up then.
-        if not (curvature > 0.0 and size > 0.0):
-            return state._replace(point=point)
-        return LBFGSState(
-            point,
-            _append(state.steps, s),
-            _append(state.changes, y),
-            curvature / size,
-            min(state.count + 1, self.memory),
-        )
-
-    def traced_step(self, problem: Any, state: LBFGSState) -> tuple[LBFGSState, Array]:
-        """Return the next state, and whether there is one; see `descend`."""
-
-        def is_searching(carry):
-            state, is_found, attempts = carry
-            return ~is_found & ((attempts == 0) | ((attempts == 1) & (state.count > 0)))
-
-        def attempt(carry):
-            state, _, attempts = carry
-            tried = select(attempts == 0, state, self._forget_traced(state))
-            new_state, is_found = self._try_traced(problem, tried)
-            return select(is_found, new_state, state), is_found, attempts + 1
+        def search(carry: tuple[LBFGSState, Array, Array]) -> tuple[LBFGSState, Array, Array]:
+            state, _, searches = carry
+            state = cond(searches == 0, _same, lambda s: self._without_memory(s.point), state)
+            found, is_found = self._search(problem, state)
+            return select(is_found, found, state), is_found, searches + 1
 
         carry = state, jnp.bool_(False), jnp.int32(0)
-        state, is_found, _ = jax.lax.while_loop(is_searching, attempt, carry)
-        return state, is_found
+        state, is_found, _ = while_loop(is_searching, search, carry)
+        return state, outcome(is_found, Ending.NO_DESCENT)
 
-    def _forget_traced(self, state: LBFGSState) -> LBFGSState:
-        nothing = jnp.zeros_like(state.steps)
-        scale = jnp.full_like(state.scale, self.first_step)
-        return LBFGSState(state.point, nothing, nothing, scale, 0 * state.count)
-
-    def _try_traced(self, problem: Any, state: LBFGSState) -> tuple[LBFGSState, Array]:
+    def _search(self, problem: Problem, state: LBFGSState) -> tuple[LBFGSState, Array]:
+        """Return the state after one line search, and whether it found a lower value."""
         point = state.point
         free = free_variables(problem.bounds, point.parameters, point.derivative)
         direction, slope = _direction(
             problem.product, point.derivative, state.steps, state.changes, state.scale, free
         )
 
-        def along(t: Array) -> Trial:
+        def along(t: Array) -> Trial[Point]:
             target, tangent = move(problem.bounds, point.parameters, direction, t)
             trial = problem.evaluate(target)
             return Trial(trial.value, jnp.vdot(trial.derivative, tangent), trial)
 
         start = Trial(point.value, slope, point)
-        found, is_found = self.line_search.traced_search(along, start, slope)
+        found, is_found = self.line_search.search(along, start)
         new = found.point
         s, y = new.parameters - point.parameters, new.derivative - point.derivative
         curvature, size = jnp.vdot(s, y), jnp.vdot(y, new.gradient - point.gradient)
+
+        def remember(state: LBFGSState) -> LBFGSState:
+            return LBFGSState(
+                new,
+                _append(state.steps, s),
+                _append(state.changes, y),
+                curvature / size,
+                jnp.minimum(state.count + 1, self.memory),
+            )
+
+        # A pair without curvature would make the matrix indefinite; the search gave up then.
         is_pair = (curvature > 0.0) & (size > 0.0)
-        remembered = LBFGSState(
-            new,
-            _append(state.steps, s),
-            _append(state.changes, y),
-            curvature / jnp.where(is_pair, size, 1.0),
-            jnp.minimum(state.count + 1, self.memory),
-        )
-        kept = state._replace(point=new)
-        is_descent = jnp.isfinite(slope) & (slope < 0.0)
-        return select(is_pair, remembered, kept), is_found & is_descent
+        return cond(is_pair, remember, lambda state: state._replace(point=new), state), is_found
+
+
+def _same(state: LBFGSState) -> LBFGSState:
+    return state
 
 
 @jax.jit

@@ -11,26 +11,52 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.control.problem import select
+from jaxcontact.transforms.loops import select, while_loop
+
+P = TypeVar("P")
 
 
-class Trial(NamedTuple):
+class Trial(NamedTuple, Generic[P]):
     """A point on the search line."""
 
-    value: Any
-    """f(t), a number, traced a scalar; infinite where f is not finite."""
+    value: Array | float
+    """f(t), a scalar; infinite where f is not finite."""
 
-    slope: Any
-    """f'(t), a number, traced a scalar; or one of the one-sided derivatives."""
+    slope: Array | float
+    """f'(t), a scalar, or one of the one-sided derivatives."""
 
-    point: Any
+    point: P
     """Whatever the caller needs of the point."""
+
+
+class Bracket(NamedTuple, Generic[P]):
+    """The search so far; all but the trial are scalars."""
+
+    step: Array
+    """t of the next trial."""
+
+    lower: Array
+    """Longest step with enough decrease."""
+
+    upper: Array
+    """Shortest step without; infinite if there is none yet."""
+
+    found: Trial[P]
+    """Trial at the lower end, at first the start."""
+
+    is_found: Array
+    """Whether a trial had enough decrease, bool."""
+
+    is_done: Array
+    """Whether both conditions hold or no number is left in between, bool."""
+
+    count: Array
+    """Number of trials, int32."""
 
 
 @dataclass(frozen=True)
@@ -47,66 +73,51 @@ class WeakWolfe:
     """Evaluations per search."""
 
     def search(
-        self, along: Callable[[float], Trial], value: float, slope: float, step: float = 1.0
-    ) -> tuple[float, Trial] | None:
-        """Search from t = 0 along a direction of descent.
+        self, along: Callable[[Array], Trial[P]], start: Trial[P], step: float = 1.0
+    ) -> tuple[Trial[P], Array]:
+        """Search from t = 0; on the host or under a trace.
 
         Args:
             along: evaluates f at t > 0.
-            value: f(0).
-            slope: f'(0) < 0.
+            start: f at t = 0; where its slope is not negative, nothing is evaluated.
             step: first t.
 
         Returns:
-            A step and its trial with both conditions; after `max_trials` the longest step found
-            with the first one; None if there is none.
-        """
-        lower, upper = 0.0, float("inf")
-        found = None
-        for _ in range(self.max_trials):
-            trial = along(step)
-            if not trial.value < value + self.decrease * step * slope:
-                upper = step
-            else:
-                found = step, trial
-                if trial.slope > self.curvature * slope:
-                    return found
-                lower = step
-            step = 2.0 * lower if upper == float("inf") else 0.5 * (lower + upper)
-            if step in (lower, upper):
-                break
-        return found
-
-    def traced_search(
-        self, along: Callable[[Array], Trial], start: Trial, slope: Array
-    ) -> tuple[Trial, Array]:
-        """Search as `search` does from t = 1, in `lax.while_loop`.
-
-        Args:
-            along: evaluates f at t > 0, traceable.
-            start: f at t = 0.
-            slope: f'(0) < 0.
-
-        Returns:
-            The trial, and whether it is one with the first condition; else the start.
+            A trial with both conditions, or after `max_trials` the longest step found with the
+            first one; and whether there is one, else the trial is the start.
         """
 
-        def is_searching(carry):
-            *_, is_done, trials = carry
-            return ~is_done & (trials < self.max_trials)
+        def is_searching(bracket: Bracket[P]) -> Array:
+            return ~bracket.is_done & (bracket.count < self.max_trials)
 
-        def attempt(carry):
-            step, lower, upper, found, is_found, _, trials = carry
-            trial = along(step)
-            is_lower = trial.value < start.value + self.decrease * step * slope
-            found = select(is_lower, trial, found)
-            lower, upper = jnp.where(is_lower, step, lower), jnp.where(is_lower, upper, step)
+        def attempt(bracket: Bracket[P]) -> Bracket[P]:
+            t = bracket.step
+            trial = along(t)
+            is_lower = jnp.asarray(trial.value < start.value + self.decrease * t * start.slope)
+            lower = jnp.where(is_lower, t, bracket.lower)
+            upper = jnp.where(is_lower, bracket.upper, t)
             following = jnp.where(jnp.isinf(upper), 2.0 * lower, 0.5 * (lower + upper))
-            is_done = is_lower & (trial.slope > self.curvature * slope)
-            is_done = is_done | (following == lower) | (following == upper)
-            return following, lower, upper, found, is_found | is_lower, is_done, trials + 1
+            is_wolfe = is_lower & (trial.slope > self.curvature * start.slope)
+            return Bracket(
+                step=following,
+                lower=lower,
+                upper=upper,
+                found=select(is_lower, trial, bracket.found),
+                is_found=bracket.is_found | is_lower,
+                is_done=is_wolfe | (following == lower) | (following == upper),
+                count=bracket.count + 1,
+            )
 
-        one, no = jnp.ones_like(start.value), jnp.bool_(False)
-        carry = one, 0.0 * one, jnp.inf * one, start, no, no, jnp.int32(0)
-        _, _, _, found, is_found, _, _ = jax.lax.while_loop(is_searching, attempt, carry)
-        return found, is_found
+        first = jnp.full_like(start.slope, step)
+        is_descent = jnp.isfinite(start.slope) & (start.slope < 0.0)
+        bracket = Bracket(
+            step=first,
+            lower=jnp.zeros_like(first),
+            upper=jnp.full_like(first, jnp.inf),
+            found=start,
+            is_found=jnp.bool_(False),
+            is_done=~is_descent,
+            count=jnp.int32(0),
+        )
+        bracket = while_loop(is_searching, attempt, bracket)
+        return bracket.found, bracket.is_found

@@ -14,14 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.control.bounds import free_variables, mask, move
 from jaxcontact.control.problem import ROUNDING, Point, Problem
-from jaxcontact.optimize.trust_region import conjugate_gradient_path
+from jaxcontact.optimize.method import Ending
+from jaxcontact.optimize.trust_region import Path, conjugate_gradient_path
 
 
 class NewtonCGState(NamedTuple):
@@ -53,22 +54,26 @@ class NewtonCG:
     max_trials: int = 40
     """Trial steps per iteration."""
 
+    is_traceable: ClassVar[bool] = False
+    """The length of the path of CG is decided on the host."""
+
     def init(self, problem: Problem, point: Point) -> NewtonCGState:
         """Return the state at the start."""
-        return NewtonCGState(point, math.inf, problem.gradient_norm(point))
+        return NewtonCGState(point, math.inf, float(problem.gradient_norm(point)))
 
-    def step(self, problem: Problem, state: NewtonCGState) -> tuple[NewtonCGState, str | None]:
-        """Return the next state, or the same one and the reason why there is none."""
+    def step(self, problem: Problem, state: NewtonCGState) -> tuple[NewtonCGState, Ending | None]:
+        """Return the next state, or why there is none."""
         point, radius, first_norm = state
+        value = float(point.value)
         free = free_variables(problem.bounds, point.parameters, point.derivative)
         derivative = mask(free, point.derivative)
         if not bool(jnp.any(derivative != 0.0)):
-            return state, "the gradient vanishes"
+            return state, Ending.VANISHED
 
         def hessian(direction: Array) -> Array:
             return problem.hessian_product(point.parameters, direction)
 
-        norm = problem.gradient_norm(point)
+        norm = float(problem.gradient_norm(point))
         path = conjugate_gradient_path(
             derivative,
             hessian,
@@ -84,21 +89,21 @@ class NewtonCG:
             target, _ = move(problem.bounds, point.parameters, step, 1.0)
             if problem.bounds is not None:
                 predicted = _predicted(point, target, hessian)
-            if problem.bounds is None and not predicted > ROUNDING * abs(point.value):
+            if problem.bounds is None and not predicted > ROUNDING * abs(value):
                 break
             trial = problem.evaluate(target)
-            ratio = (point.value - trial.value) / predicted if predicted > 0.0 else -math.inf
+            ratio = (value - float(trial.value)) / predicted if predicted > 0.0 else -math.inf
             if ratio < 0.25:
-                step_norm = math.sqrt(max(problem.dot(step, step), 0.0))
+                step_norm = math.sqrt(max(float(problem.dot(step, step)), 0.0))
                 radius = 0.25 * min(radius, step_norm)
             elif ratio > 0.75 and is_cut:
                 radius = 2.0 * radius
-            if ratio >= self.acceptance and trial.value < point.value:
+            if ratio >= self.acceptance and trial.value < value:
                 return NewtonCGState(trial, radius, first_norm), None
-        return state, "the trust region shrank to nothing; this is a kink or a minimum"
+        return state, Ending.NO_DESCENT
 
 
-def _first_radius(path) -> float:
+def _first_radius(path: Path) -> float:
     """Return the length of the whole path, or without a minimiser that of the gradient step."""
     last = path.segments[-1]
     square = last.start_square

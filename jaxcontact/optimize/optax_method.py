@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ import optax
 from jax import Array
 
 from jaxcontact.control.problem import Point, Problem
+from jaxcontact.optimize.method import Ending, Outcome, outcome
 
 
 class OptaxState(NamedTuple):
@@ -21,7 +21,7 @@ class OptaxState(NamedTuple):
     point: Point
     """Current iterate; not always the best one."""
 
-    transformation: Any
+    transformation: optax.OptState
     """State of the gradient transformation."""
 
 
@@ -36,27 +36,24 @@ class Optax:
     transformation: optax.GradientTransformation
     """Maps gradients to updates. It must need neither values nor a function to search along."""
 
+    is_traceable: ClassVar[bool] = True
+    """Whether `descend` can trace it."""
+
     def init(self, problem: Problem, point: Point) -> OptaxState:
         """Return the state at the start."""
         del problem
         return OptaxState(point, self.transformation.init(point.parameters))
 
-    def step(self, problem: Problem, state: OptaxState) -> tuple[OptaxState, str | None]:
-        """Return the next state, or the same one and the reason why there is none."""
+    def step(self, problem: Problem, state: OptaxState) -> tuple[OptaxState, Outcome]:
+        """Return the state after one update, or that it is not finite."""
         target, transformation = _update(self.transformation.update, *state)
-        trial = problem.evaluate(problem.project(target))
-        if not math.isfinite(trial.value):
-            return state, "the objective is not finite after an update; try a smaller learning rate"
-        return OptaxState(trial, transformation), None
-
-    def traced_step(self, problem: Any, state: OptaxState) -> tuple[OptaxState, Array]:
-        """Return the next state, and whether it is finite; see `descend`."""
-        target, transformation = _update(self.transformation.update, *state)
-        trial = problem.evaluate(problem.project(target))
-        return OptaxState(trial, transformation), jnp.isfinite(trial.value)
+        new = problem.evaluate(problem.project(target))
+        return OptaxState(new, transformation), outcome(jnp.isfinite(new.value), Ending.NOT_FINITE)
 
 
 @partial(jax.jit, static_argnums=0)
-def _update(update, point: Point, state: Any):
+def _update(
+    update: optax.TransformUpdateFn, point: Point, state: optax.OptState
+) -> tuple[Array, optax.OptState]:
     updates, state = update(point.gradient, state, point.parameters)
-    return optax.apply_updates(point.parameters, updates), state
+    return cast(Array, optax.apply_updates(point.parameters, updates)), state

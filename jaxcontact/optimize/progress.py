@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Protocol
 
 
-def progress_bar(total: int) -> Any:
+class ProgressBar(Protocol):
+    """What is used of a tqdm bar."""
+
+    def set_postfix_str(self, s: str, refresh: bool) -> None:
+        """Set the text behind the bar."""
+        ...
+
+    def update(self, n: int) -> object:
+        """Move the bar on."""
+        ...
+
+    def close(self) -> None:
+        """End the bar."""
+        ...
+
+
+def progress_bar(total: int) -> ProgressBar:
     """Return a tqdm bar.
 
     Raises:

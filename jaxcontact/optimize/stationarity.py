@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.control.bounds import BoundsLike
 from jaxcontact.control.inner_product import InnerProduct
-from jaxcontact.control.problem import as_partial
+from jaxcontact.control.problem import ControlMap, Problem, as_partial
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
-from jaxcontact.optimize.driver import state_problem
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -24,8 +23,8 @@ def stationarity(
     *,
     system: System | None = None,
     dt: float | Array | None = None,
-    bounds: tuple[Any, Any] | None = None,
-    controls: Any = None,
+    bounds: BoundsLike | None = None,
+    controls: ControlMap | Callable[[Array], Array] | None = None,
     inner_product: InnerProduct | None = None,
     motion: Callable[[Array], Trajectory] | None = None,
     tolerance: float = 1e-4,
@@ -55,7 +54,15 @@ def stationarity(
         ValueError: if the motion is not known or not recorded in every step.
     """
     u = jnp.asarray(u)
-    problem = state_problem(objective, u, system, dt, bounds, controls, inner_product)
+    problem = Problem.of(
+        objective,
+        u,
+        system=system,
+        dt=dt,
+        bounds=bounds,
+        controls=controls,
+        inner_product=inner_product,
+    )
     motion = motion_of(problem) if motion is None else as_partial(motion)
     if motion is None:
         raise ValueError(

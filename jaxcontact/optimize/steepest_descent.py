@@ -8,15 +8,15 @@ With bounds the step is s = P(p - G / omega) - p. Source: section 5 of the paper
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.control.problem import ROUNDING, Point, Problem, select
+from jaxcontact.control.problem import ROUNDING, Point, Problem
+from jaxcontact.optimize.method import Ending, Outcome, outcome
+from jaxcontact.transforms.loops import cond, while_loop
 
 
 class SteepestDescentState(NamedTuple):
@@ -25,8 +25,27 @@ class SteepestDescentState(NamedTuple):
     point: Point
     """Current iterate."""
 
-    regularization: float
-    """omega of the next trial."""
+    regularization: Array
+    """omega of the next trial, a scalar."""
+
+
+class Trials(NamedTuple):
+    """Trial steps of one iteration."""
+
+    point: Point
+    """The last trial."""
+
+    regularization: Array
+    """omega of the next trial, a scalar."""
+
+    is_found: Array
+    """Whether the last trial is accepted, bool."""
+
+    is_hopeless: Array
+    """Whether the decrease to be expected is below rounding, bool."""
+
+    count: Array
+    """Number of trials, int32."""
 
 
 @dataclass(frozen=True)
@@ -48,58 +67,41 @@ class SteepestDescent:
     max_trials: int = 40
     """Trial steps per iteration."""
 
+    is_traceable: ClassVar[bool] = True
+    """Whether `descend` can trace it."""
+
     def init(self, problem: Problem, point: Point) -> SteepestDescentState:
         """Return the state at the start."""
         del problem
-        return SteepestDescentState(point, self.regularization)
+        omega = jnp.asarray(self.regularization, point.parameters.dtype)
+        return SteepestDescentState(point, omega)
 
     def step(
         self, problem: Problem, state: SteepestDescentState
-    ) -> tuple[SteepestDescentState, str | None]:
-        """Return the next state, or the same one and the reason why there is none."""
-        point, omega = state
-        for _ in range(self.max_trials):
-            target = problem.project(point.parameters - point.gradient / omega)
-            step = target - point.parameters
-            slope = float(jnp.vdot(point.derivative, step))
-            predicted = -slope - 0.5 * omega * problem.dot(step, step)
-            if not predicted > ROUNDING * abs(point.value):
-                break
-            trial = problem.evaluate(target)
-            ratio = (point.value - trial.value) / predicted
-            factor = 2.0 - ratio if math.isfinite(ratio) else math.inf
-            next_omega = omega * min(max(factor, self.reduction), self.increase)
-            if ratio >= self.acceptance and trial.value < point.value:
-                return SteepestDescentState(trial, next_omega), None
-            omega = next_omega
-        return state, "no step along the gradient reduces the value; this is a kink or a minimum"
+    ) -> tuple[SteepestDescentState, Outcome]:
+        """Return the state after the first trial that is accepted, or why there is none."""
+        point = state.point
 
-    def traced_step(
-        self, problem: Any, state: SteepestDescentState
-    ) -> tuple[SteepestDescentState, Array]:
-        """Return the next state, and whether there is one; see `descend`."""
-        point, first_omega = state
+        def is_searching(trials: Trials) -> Array:
+            return ~trials.is_found & ~trials.is_hopeless & (trials.count < self.max_trials)
 
-        def is_searching(carry):
-            _, _, is_found, is_hopeless, trials = carry
-            return ~is_found & ~is_hopeless & (trials < self.max_trials)
-
-        def attempt(carry):
-            _, omega, _, _, trials = carry
+        def attempt(trials: Trials) -> Trials:
+            omega = trials.regularization
             target = problem.project(point.parameters - point.gradient / omega)
             step = target - point.parameters
             slope = jnp.vdot(point.derivative, step)
             predicted = -slope - 0.5 * omega * problem.dot(step, step)
             is_hopeless = ~(predicted > ROUNDING * jnp.abs(point.value))
-            trial = problem.evaluate(target)
+            trial = cond(is_hopeless, lambda _: point, problem.evaluate, target)
             ratio = (point.value - trial.value) / jnp.where(is_hopeless, 1.0, predicted)
             factor = jnp.where(jnp.isfinite(ratio), 2.0 - ratio, jnp.inf)
-            omega = omega * jnp.clip(factor, self.reduction, self.increase)
-            is_found = (ratio >= self.acceptance) & (trial.value < point.value) & ~is_hopeless
-            return trial, omega, is_found, is_hopeless, trials + 1
+            factor = jnp.clip(factor, self.reduction, self.increase).astype(omega.dtype)
+            is_found = (ratio >= self.acceptance) & (trial.value < point.value)
+            return Trials(trial, omega * factor, is_found, is_hopeless, trials.count + 1)
 
         no, none = jnp.bool_(False), jnp.int32(0)
-        trial, omega, is_found, _, _ = jax.lax.while_loop(
-            is_searching, attempt, (point, first_omega, no, no, none)
+        trials = while_loop(
+            is_searching, attempt, Trials(point, state.regularization, no, no, none)
         )
-        return SteepestDescentState(select(is_found, trial, point), omega), is_found
+        new = SteepestDescentState(trials.point, trials.regularization)
+        return new, outcome(trials.is_found, Ending.NO_DESCENT)
