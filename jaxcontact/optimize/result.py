@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from jaxcontact.optimize.certificate import Stationarity
+from jaxcontact.optimize.method import Ending, MethodState, S
+from jaxcontact.transforms.files import atomic_write
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class History:
     def to_csv(self, path: str | Path) -> None:
         """Write one line per iteration, with a header line."""
         names = [column.name for column in fields(self)]
-        with open(path, "w", newline="") as file:
+        with atomic_write(path, "w") as file:
             writer = csv.writer(file)
             writer.writerow(["iteration", *names])
             columns = [getattr(self, name).tolist() for name in names]
@@ -58,62 +62,98 @@ class Result:
     history: History = field(repr=False)
     """One entry per iteration."""
 
-    status: str
-    """Why the optimisation ended, in words."""
+    status: Ending
+    """Why the optimisation ended: text that says what it means and what to do next."""
 
-    stationarity: Any = None
+    stationarity: Stationarity | None = None
     """Certificate of strong stationarity; None if there is none."""
 
     method: str = ""
     """Name of the method."""
 
-    state: Any = field(default=None, repr=False)
-    """Everything the method needs to go on as if it had not been interrupted."""
+    state: MethodState | Sequence[np.ndarray] | None = field(default=None, repr=False)
+    """Everything the method needs to go on as if it had not been interrupted; from a file the
+    leaves alone."""
 
     def save(self, path: str | Path) -> None:
-        """Write the result to an .npz file, from which `load_result` and `optimize` go on."""
-        names = [column.name for column in fields(History)]
-        data = {f"history_{name}": getattr(self.history, name) for name in names}
+        """Write the result to an .npz file, from which `load_result` and `optimize` go on.
+
+        The certificate is not kept. If the writing fails or is killed, a file that was there
+        before is still there.
+        """
+        data = {f"history_{name}": getattr(self.history, name) for name in COLUMNS}
         for number, leaf in enumerate(jax.tree.leaves(self.state)):
-            data[f"state_{number:03d}"] = np.asarray(leaf)
-        with open(path, "wb") as file:  # a file object: NumPy would append .npz to a bare name
+            data[_state_name(number)] = np.asarray(leaf)
+        with atomic_write(path, "wb") as file:
             np.savez_compressed(
                 file,
                 control=np.asarray(self.control),
                 parameters=np.asarray(self.parameters),
                 value=self.value,
-                status=self.status,
+                status=self.status.name,
                 method=self.method,
                 **data,
             )
+
+
+COLUMNS = tuple(column.name for column in fields(History))
 
 
 def load_result(path: str | Path) -> Result:
     """Read a result that `Result.save` wrote; hand it to `optimize` as start to go on.
 
     Raises:
-        ValueError: if the file holds something else.
+        OSError: if there is no such file, or it may not be read.
+        ValueError: if the file is damaged or holds something else.
     """
-    with np.load(path, allow_pickle=False) as data:
-        needed = {"control", "parameters", "value", "status", "method"}
-        missing = (needed | {f"history_{column.name}" for column in fields(History)}) - set(data)
-        if missing:
-            raise ValueError(f"{path} holds no saved result; {sorted(missing)} are missing")
-        names = sorted(name for name in data.files if name.startswith("state_"))
-        return Result(
-            control=jnp.asarray(data["control"]),
-            parameters=jnp.asarray(data["parameters"]),
-            value=float(data["value"]),
-            history=History(
-                **{column.name: data[f"history_{column.name}"] for column in fields(History)}
-            ),
-            status=str(data["status"]),
-            method=str(data["method"]),
-            state=[data[name] for name in names],
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
+            data = {name: arrays[name] for name in arrays.files}
+    except (FileNotFoundError, PermissionError):
+        raise
+    # Whatever the readers of zip and npy raise on bytes that they do not expect.
+    except Exception as error:
+        raise ValueError(
+            f"{path} cannot be read as a saved result ({type(error).__name__}: {error}); it is "
+            "damaged or another kind of file. Load a copy, or run the optimisation again"
+        ) from error
+    needed = {"control", "parameters", "value", "status", "method"}
+    missing = (needed | {f"history_{name}" for name in COLUMNS}) - set(data)
+    if missing:
+        raise ValueError(f"{path} holds no saved result; {sorted(missing)} are missing")
+    history = History(**{name: data[f"history_{name}"] for name in COLUMNS})
+    leaves = [_state_name(k) for k in range(sum(name.startswith("state_") for name in data))]
+    is_whole = (
+        all(data[name].shape == () for name in ("value", "status", "method"))
+        and data["value"].dtype.kind == "f"
+        and str(data["status"]) in Ending.__members__
+        and all(data[name].dtype.kind == "f" for name in ("control", "parameters"))
+        and history.value.ndim == 1
+        and history.value.size > 0
+        and all(getattr(history, name).shape == history.value.shape for name in COLUMNS)
+        and all(name in data for name in leaves)
+    )
+    if not is_whole:
+        raise ValueError(
+            f"{path} holds a result whose parts do not fit each other; it is damaged or of another "
+            f"version. Start anew from numpy.load({str(path)!r})['parameters']"
         )
+    return Result(
+        control=jnp.asarray(data["control"]),
+        parameters=jnp.asarray(data["parameters"]),
+        value=float(data["value"]),
+        history=history,
+        status=Ending[str(data["status"])],
+        method=str(data["method"]),
+        state=[data[name] for name in leaves],
+    )
 
 
-def rebuild_state(template: Any, result: Result, method: str) -> Any:
+def _state_name(number: int) -> str:
+    return f"state_{number:03d}"
+
+
+def rebuild_state(template: S, result: Result, method: str) -> S:
     """Return the state of a result in the structure, types and shapes of a template.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 
 #: Longest text of a wrong value that a message quotes.
@@ -24,8 +25,9 @@ def check_option(name: str, value: object, protocol: type | tuple[type, ...], ex
     if isinstance(value, type):
         example = f"jc.{example}"
         if isinstance(value, protocol):  # a class has the methods of its objects
-            is_ours = value.__module__.split(".")[0] == __name__.split(".")[0]
-            example = f"{'jc.' if is_ours else ''}{value.__name__}()"
+            package = sys.modules[__name__.split(".")[0]]
+            is_public = getattr(package, value.__name__, None) is value
+            example = f"{'jc.' if is_public else ''}{value.__name__}()"
         raise ValueError(
             f"{name} must be an object, such as {example}, got the class {value.__name__}"
         )

@@ -188,6 +188,7 @@ def test_optimize_continues_a_saved_result_bit_for_bit(problem, method, tmp_path
     first = jc.optimize(objective, start, method=method, iterations=4, **space)
     first.save(tmp_path / "result.npz")
     loaded = jc.load_result(tmp_path / "result.npz")
+    assert loaded.status is first.status is jc.Ending.STOPPED
     rest = jc.optimize(objective, loaded, method=method, iterations=5, **space)
     np.testing.assert_array_equal(rest.control, whole.control)
     for name in ("value", "gradient_norm", "evaluations", "hessian_products"):

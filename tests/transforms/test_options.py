@@ -65,7 +65,7 @@ def test_check_option_names_a_class_that_only_misses_its_parentheses():
     assert "such as jc.Newton(), got the class int" in message(int)
 
 
-def test_check_option_writes_jc_before_a_class_of_the_package():
+def test_check_option_writes_jc_before_a_public_class():
     text = message(jc.HalfSpace, (Solver, Obstacle))
     assert "such as jc.HalfSpace(), got the class HalfSpace" in text
 
