@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from jaxcontact.control.inner_product import L2, InnerProduct, RegionL2, Weighted, lumped_mass
 from jaxcontact.system import assembly
@@ -101,8 +101,8 @@ def actuator(
     system: System,
     steps: int,
     *,
-    nodes: Any = None,
-    direction: Any = None,
+    nodes: ArrayLike | None = None,
+    direction: ArrayLike | None = None,
     intervals: int | Sequence[int] | None = None,
 ) -> Actuator:
     """Return an actuator that applies a force per volume on a region.
@@ -126,7 +126,7 @@ def boundary_actuator(
     steps: int,
     facets: np.ndarray,
     *,
-    direction: Any = None,
+    direction: ArrayLike | None = None,
     intervals: int | Sequence[int] | None = None,
 ) -> Actuator:
     """Return an actuator that applies a traction, [N/m^(d-1)], on a facet set.
@@ -150,7 +150,11 @@ def boundary_actuator(
 
 
 def _make(
-    system: System, steps: int, nodes: np.ndarray, direction: Any, intervals: Any
+    system: System,
+    steps: int,
+    nodes: np.ndarray,
+    direction: ArrayLike | None,
+    intervals: int | Sequence[int] | None,
 ) -> Actuator:
     """Return a volume actuator."""
     numbers = _interval_of_each_step(steps, intervals)
@@ -167,7 +171,7 @@ def _make(
     )
 
 
-def _check_nodes(system: System, nodes: Any) -> np.ndarray:
+def _check_nodes(system: System, nodes: ArrayLike | None) -> np.ndarray:
     nodes = np.arange(system.n_nodes) if nodes is None else np.asarray(nodes)
     if nodes.dtype == bool:
         if nodes.shape != (system.n_nodes,):
@@ -182,7 +186,7 @@ def _check_nodes(system: System, nodes: Any) -> np.ndarray:
     return nodes.astype(np.int32)
 
 
-def _check_direction(system: System, direction: Any) -> Array | None:
+def _check_direction(system: System, direction: ArrayLike | None) -> Array | None:
     if direction is None:
         return None
     direction = np.asarray(direction, float)

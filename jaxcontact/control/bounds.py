@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 #: Lower and upper bound as a user gives them: numbers or arrays that broadcast.
 BoundsLike = tuple[ArrayLike, ArrayLike]

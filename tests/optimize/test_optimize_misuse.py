@@ -10,6 +10,7 @@ from support.kinked import START, grazing
 from support.optimize_problems import quadratic
 
 import jaxcontact as jc
+from jaxcontact.control.inner_product import Weighted
 
 METHODS = [jc.SteepestDescent(), jc.LBFGS(memory=4), jc.NewtonCG(), jc.Optax(optax.sgd(0.1))]
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
@@ -73,13 +74,30 @@ def test_optimize_starts_within_the_bounds(problem, method):
         ({"bounds": (np.nan, 1.0)}, "above their upper bounds or NaN"),
         ({"bounds": (jnp.zeros(3), 1.0)}, r"a bound of shape \(3,\) does not fit"),
         ({"bounds": (0.0, 1.0, 2.0)}, "a pair"),
+        ({"bounds": "positive"}, "a pair"),
         ({"iterations": -1}, "not be negative"),
+        ({"inner_product": Weighted}, "inner_product must be an object, such as Weighted"),
+        ({"inner_product": 2.0}, r"inner_product must be .* got 2\.0"),
+        ({"controls": lambda p: p}, r"controls must be an object, such as jc\.actuator"),
     ],
 )
 def test_optimize_refuses_options_that_do_not_fit(problem, options, message):
     objective, start, space = problem
     with pytest.raises(ValueError, match=message):
         jc.optimize(objective, start, **space, **options)
+
+
+def test_every_entry_refuses_what_is_no_problem(problem):
+    objective, start, space = problem
+    for enter in (jc.optimize, jc.descend, jc.stationarity):
+        with pytest.raises(ValueError, match="must be a function of a control, got float"):
+            enter(3.0, start, **space)
+        with pytest.raises(ValueError, match="floating point numbers, got int"):
+            enter(objective, np.zeros(start.shape, int), **space)
+        with pytest.raises(ValueError, match="system= and dt="):
+            enter(objective, start)
+        with pytest.raises(ValueError, match="above their upper bounds"):
+            enter(objective, start, bounds=(1.0, -1.0), **space)
 
 
 @pytest.mark.parametrize("shape", [(3, 2), (3, 4, 1), (3, 2, 2)], ids=str)
