@@ -79,7 +79,7 @@ class LBFGS:
 
         def search(carry: tuple[LBFGSState, Array, Array]) -> tuple[LBFGSState, Array, Array]:
             state, _, searches = carry
-            state = cond(searches == 0, _same, lambda s: self._without_memory(s.point), state)
+            state = cond(searches == 0, lambda s: s, lambda s: self._without_memory(s.point), state)
             found, is_found = self._search(problem, state)
             return select(is_found, found, state), is_found, searches + 1
 
@@ -118,10 +118,6 @@ class LBFGS:
         # A pair without curvature would make the matrix indefinite; the search gave up then.
         is_pair = (curvature > 0.0) & (size > 0.0)
         return cond(is_pair, remember, lambda state: state._replace(point=new), state), is_found
-
-
-def _same(state: LBFGSState) -> LBFGSState:
-    return state
 
 
 @jax.jit
