@@ -88,7 +88,7 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
             radius that defines no surface.
     """
     check_obstacle(obstacle, points.shape[1])
-    gap, gradient = _distance_and_gradient(obstacle, points)
+    gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
     length = jnp.linalg.norm(gradient, axis=1, keepdims=True)
     if not isinstance(length, Tracer) and not np.all(np.asarray(length) > 0.0):
         raise ValueError(
@@ -96,11 +96,6 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
             "at a contact node, so no contact normal exists there; is a node at the centre?"
         )
     return gap, -gradient / length
-
-
-@jax.jit
-def _distance_and_gradient(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
-    return jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
 
 
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:

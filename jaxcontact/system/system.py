@@ -17,9 +17,9 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.scene.material import KelvinVoigt
-from jaxcontact.scene.obstacle import gap_and_normals
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.system import assembly
+from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -171,9 +171,11 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
         is_elastic=is_elastic(scene),
     )
-    nodes, gap, vectors, area = _contact_pairs(scene, points)
+    # Under jit too, what is concrete stays so and can be checked and compared.
+    with jax.ensure_compile_time_eval():
+        pairs = contact_pairs(scene, jnp.asarray(mesh.points, dtype))
     components = np.arange(dimension, dtype=np.int32)
-    unknowns = numbers[nodes].astype(np.int32)[:, None] * dimension + components[None, :]
+    unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
     def on_free(values: Array) -> SymmetricMatrix:
         return SymmetricMatrix(values, pattern.columns)
@@ -184,11 +186,11 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(vectors, unknowns),
-        gap=gap,
+        normals=ContactNormals(pairs.normals, unknowns),
+        gap=pairs.gap,
         load=values.load[free_nodes].reshape(-1),
-        contact_nodes=nodes,
-        contact_area=area,
+        contact_nodes=pairs.nodes,
+        contact_area=pairs.area,
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
@@ -254,32 +256,6 @@ def _check_dtype(dtype) -> None:
             "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
             "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
         )
-
-
-def _contact_pairs(scene: Scene, points: Array) -> tuple[np.ndarray, Array, Array, Array]:
-    """Return node (C,), gap (C,), normal (C, d) and area (C,) of every contact pair."""
-    nodes, gaps, normals, areas = [], [], [], []
-    # Sets with one obstacle are one set: a node that is in both must not get the same pair twice.
-    sets: dict[int, list[str]] = {}
-    for name in sorted(scene.contact):
-        sets.setdefault(id(scene.contact[name]), []).append(name)
-    for names in sets.values():
-        facets = np.unique(np.concatenate([scene.mesh.facets[name] for name in names]), axis=0)
-        set_nodes = np.unique(facets)
-        gap, vectors = gap_and_normals(scene.contact[names[0]], points[set_nodes])
-        nodes.append(set_nodes)
-        gaps.append(gap)
-        normals.append(vectors)
-        areas.append(assembly.nodal_areas(points, facets)[set_nodes])
-    if not nodes:
-        nothing = jnp.zeros(0, points.dtype)
-        return np.zeros(0, np.int32), nothing, points[:0], nothing
-    return (
-        np.concatenate(nodes).astype(np.int32),
-        jnp.concatenate(gaps),
-        jnp.concatenate(normals),
-        jnp.concatenate(areas),
-    )
 
 
 def _free_components(system: System, y: Array) -> Array:
