@@ -12,11 +12,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
-Number = float | Array
+from jaxcontact.transforms.traced import as_array, is_traced
+
+Number = float | Array | np.ndarray
+
+#: What each field has to be, as a condition and in words.
+_RANGES = {
+    "young": (lambda x: (x > 0.0) & (x < np.inf), "positive"),
+    "poisson": (
+        lambda x: (x > -1.0) & (x < 0.5),
+        "in (-1, 1/2); use 0.49 for nearly incompressible",
+    ),
+    "bulk_viscosity": (lambda x: (x >= 0.0) & (x < np.inf), "zero or positive"),
+    "shear_viscosity": (lambda x: (x >= 0.0) & (x < np.inf), "zero or positive"),
+    "density": (lambda x: (x > 0.0) & (x < np.inf), "positive"),
+}
 
 
 @jax.tree_util.register_dataclass
@@ -24,7 +38,8 @@ Number = float | Array
 class KelvinVoigt:
     """An isotropic, linearly viscoelastic material; every field can be differentiated.
 
-    The values are checked by `discretize`.
+    Each field is a scalar, or one value per cell of the mesh, (E,). The values are checked by
+    `discretize`; values that are out of range while JAX traces them make NaN matrices.
     """
 
     young: Number
@@ -55,32 +70,45 @@ class KelvinVoigt:
     def is_elastic(self) -> bool:
         """Return True if both viscosities are known to be zero (a traced viscosity is not)."""
         return all(
-            not isinstance(viscosity, Tracer) and not np.any(np.asarray(viscosity))
+            not is_traced(viscosity) and not np.any(np.asarray(viscosity))
             for viscosity in (self.bulk_viscosity, self.shear_viscosity)
         )
 
 
-def check_material(material: KelvinVoigt) -> None:
+def check_material(material: KelvinVoigt, n_cells: int | None = None) -> None:
     """Check the values that are concrete.
 
+    Args:
+        material: the material.
+        n_cells: number of cells E; None is a material of a region, with scalars only.
+
     Raises:
-        ValueError: if a value lies outside its range, is not finite or is not a scalar.
+        ValueError: if a value lies outside its range or is not finite, or is neither a scalar nor
+            one value per cell.
     """
-    admissible = {
-        "young": (lambda x: x > 0.0, "positive"),
-        "poisson": (lambda x: -1.0 < x < 0.5, "in (-1, 1/2); use 0.49 for nearly incompressible"),
-        "bulk_viscosity": (lambda x: x >= 0.0, "zero or positive"),
-        "shear_viscosity": (lambda x: x >= 0.0, "zero or positive"),
-        "density": (lambda x: x > 0.0, "positive"),
-    }
-    for name, (is_admissible, description) in admissible.items():
-        value = getattr(material, name)
-        if np.ndim(value) != 0:
+    for name, (is_in_range, description) in _RANGES.items():
+        value = as_array(getattr(material, name))
+        if value.shape not in ((), (n_cells,)):
+            cellwise = "" if n_cells is None else f" or have one value per cell, ({n_cells},)"
             raise ValueError(
-                f"KelvinVoigt.{name} must be a scalar, got shape {np.shape(value)}; give each "
-                "region its own material, Scene(material={region: KelvinVoigt(...)})"
+                f"KelvinVoigt.{name} must be a scalar{cellwise}, got shape {value.shape}; give "
+                "each region its own material, Scene(material={region: KelvinVoigt(...)})"
             )
-        if isinstance(value, Tracer):
+        if is_traced(value):
             continue
-        if not np.isfinite(value) or not is_admissible(float(value)):
-            raise ValueError(f"KelvinVoigt.{name} must be {description}, got {value}")
+        value = np.asarray(value, float)
+        wrong = np.flatnonzero(~is_in_range(value))
+        if wrong.size:
+            cells = f" in {wrong.size} cells, first {wrong[:5].tolist()}" if value.ndim else ""
+            first = value.ravel()[wrong[0]]
+            raise ValueError(f"KelvinVoigt.{name} must be {description}, got {first}{cells}")
+
+
+def is_admissible(material: KelvinVoigt) -> Array:
+    """Return whether every value lies in its range, a boolean scalar; for traced values."""
+    values = {name: jnp.asarray(getattr(material, name)) for name in _RANGES}
+    return jnp.all(
+        jnp.stack(
+            [jnp.all(is_in_range(values[name])) for name, (is_in_range, _) in _RANGES.items()]
+        )
+    )

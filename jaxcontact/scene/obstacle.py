@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
+
+from jaxcontact.transforms.traced import as_array, is_traced, poison_unless
+
+#: How far the slope of a signed distance may be from 1: grids and blends need a little.
+SLOPE_TOLERANCE = 1e-2
 
 
 class Obstacle(Protocol):
@@ -65,15 +69,26 @@ class Ball:
 class SignedDistance:
     """An obstacle given by a user's function.
 
-    The gap is the function's value at the contact nodes, the normal its normalised gradient.
+    The gap is the function's value at the contact nodes, the normal its normalised gradient, which
+    must have length 1 (within 1 %): a level set such as x . x - r^2 is no distance.
+
+    Data that the function captures is read by every `discretize`, but is constant in a program
+    under jax.jit; what changes there, or is differentiated, goes into `parameters`.
     """
 
-    function: Callable[[Array], Array] = field(metadata={"static": True})
-    """Maps one point (d,) [m] to its signed distance, a scalar [m]; written with jax.numpy."""
+    function: Callable[..., Array] = field(metadata={"static": True})
+    """Maps one point (d,) [m], and the parameters if there are any, to the signed distance of the
+    point, a scalar [m]; written with jax.numpy."""
+
+    parameters: Any = None
+    """Second argument of the function, a pytree of arrays; None is none."""
 
     def signed_distance(self, x: Array) -> Array:
-        """Return the signed distance of one point (d,), a scalar [m]."""
-        return self.function(x)
+        """Return the signed distance of one point (d,), a scalar [m].
+
+        Derivative: by the point and the parameters.
+        """
+        return self.function(x) if self.parameters is None else self.function(x, self.parameters)
 
 
 def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
@@ -83,19 +98,36 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
         obstacle: the rigid obstacle.
         points: contact nodes in the reference configuration, (C, d) [m].
 
+    A wrong slope or radius that is traced makes the result NaN.
+
     Raises:
         ValueError: if the obstacle does not fit the dimension of the points, or has a normal or
-            radius that defines no surface.
+            radius that defines no surface, or its signed distance has a slope other than 1.
     """
     check_obstacle(obstacle, points.shape[1])
     gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
-    length = jnp.linalg.norm(gradient, axis=1, keepdims=True)
-    if not isinstance(length, Tracer) and not np.all(np.asarray(length) > 0.0):
+    slope = jnp.linalg.norm(gradient, axis=1, keepdims=True)
+    if not is_traced(slope):
+        _check_slope(obstacle, np.asarray(slope))
+    is_distance = jnp.all(jnp.abs(slope - 1.0) <= SLOPE_TOLERANCE)
+    is_surface = jnp.asarray(getattr(obstacle, "radius", 1.0)) > 0.0
+    return poison_unless(is_distance & is_surface, (gap, -gradient / slope))
+
+
+def _check_slope(obstacle: Obstacle, slope: np.ndarray) -> None:
+    what = f"the signed distance of {type(obstacle).__name__}"
+    if not np.all(slope > 0.0):
         raise ValueError(
-            f"the signed distance of {type(obstacle).__name__} has a zero or undefined gradient "
-            "at a contact node, so no contact normal exists there; is a node at the centre?"
+            f"{what} has a zero or undefined gradient at a contact node, so no contact normal "
+            "exists there; is a node at the centre?"
         )
-    return gap, -gradient / length
+    worst = slope.flat[np.argmax(np.abs(slope - 1.0))]
+    if abs(worst - 1.0) > SLOPE_TOLERANCE:
+        raise ValueError(
+            f"{what} has a gradient of length {worst:.4g} at a contact node, that of a distance "
+            f"has length 1 (within {SLOPE_TOLERANCE}); divide the function by the length of its "
+            "gradient, or return the distance itself"
+        )
 
 
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
@@ -106,19 +138,21 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
             radius is not positive.
     """
     for name in ("point", "normal", "center"):
-        value = getattr(obstacle, name, None)
-        if value is None:
+        field_value = getattr(obstacle, name, None)
+        if field_value is None:
             continue
-        where = f"{type(obstacle).__name__}.{name}"
-        if np.shape(value) != (dimension,):
-            raise ValueError(f"{where} must have shape ({dimension},), got {np.shape(value)}")
-        if isinstance(value, Tracer):
+        where, value = f"{type(obstacle).__name__}.{name}", as_array(field_value)
+        if value.shape != (dimension,):
+            raise ValueError(f"{where} must have shape ({dimension},), got {value.shape}")
+        if is_traced(value):
             continue
         if not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"{where} must be finite, got {value}")
         # np.asarray first: under jit the methods of a concrete JAX array give tracers.
         if name == "normal" and not np.any(np.asarray(value)):
             raise ValueError(f"{where} must not be the zero vector")
-    radius = getattr(obstacle, "radius", None)
-    if radius is not None and not isinstance(radius, Tracer) and not np.asarray(radius) > 0.0:
+    radius = as_array(getattr(obstacle, "radius", 1.0))
+    if radius.shape != ():
+        raise ValueError(f"Ball.radius must be a scalar, got shape {radius.shape}")
+    if not is_traced(radius) and not np.asarray(radius) > 0.0:
         raise ValueError(f"Ball.radius must be positive, got {radius}")

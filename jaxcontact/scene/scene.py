@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
 from jaxcontact.scene.material import KelvinVoigt, check_material
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Obstacle, check_obstacle
+from jaxcontact.transforms.traced import as_array, is_traced
 
 
 @jax.tree_util.register_dataclass
@@ -82,9 +82,10 @@ def clamped_nodes(scene: Scene) -> np.ndarray:
 
 
 def cellwise_material(scene: Scene) -> KelvinVoigt:
-    """Return the material with scalar fields, or with one value per cell (E,) if regions differ."""
+    """Return the material with arrays as fields: scalars, or one value per cell (E,)."""
     if isinstance(scene.material, KelvinVoigt):
-        return scene.material
+        values = {f.name: getattr(scene.material, f.name) for f in fields(KelvinVoigt)}
+        return KelvinVoigt(**{name: jnp.asarray(value, float) for name, value in values.items()})
     region_of_cell = np.zeros(scene.mesh.n_cells, np.int32)
     for number, region in enumerate(scene.material):
         region_of_cell[scene.mesh.regions[region]] = number
@@ -102,15 +103,16 @@ def is_elastic(scene: Scene) -> bool:
 
 
 def _check_vector(name: str, vector: Any, dimension: int) -> None:
-    if np.shape(vector) != (dimension,):
-        raise ValueError(f"{name} must have shape ({dimension},), got {np.shape(vector)}")
-    if not isinstance(vector, Tracer) and not np.all(np.isfinite(np.asarray(vector))):
+    vector = as_array(vector)
+    if vector.shape != (dimension,):
+        raise ValueError(f"{name} must have shape ({dimension},), got {vector.shape}")
+    if not is_traced(vector) and not np.all(np.isfinite(np.asarray(vector))):
         raise ValueError(f"{name} must be finite, got {vector}")
 
 
 def _check_materials(scene: Scene) -> None:
     if isinstance(scene.material, KelvinVoigt):
-        check_material(scene.material)
+        check_material(scene.material, scene.mesh.n_cells)
         return
     if not isinstance(scene.material, Mapping):
         raise ValueError(
