@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.scene.material import KelvinVoigt
+from jaxcontact.scene.material import KelvinVoigt, is_admissible
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.system import assembly
 from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.traced import poison_unless
 
 
 @jax.tree_util.register_dataclass
@@ -132,7 +133,8 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     """Assemble the P1 system of a scene.
 
     Traceable in material, obstacles, loads and node positions; the connectivity and the names
-    must be concrete.
+    must be concrete. What cannot raise because it is traced makes the system NaN: a material out of
+    range, an inverted cell, an obstacle that is none.
 
     Args:
         scene: the scene.
@@ -238,7 +240,7 @@ def _assemble(
         load = load + weights[:, None] * body_force[None, :]
     for facets, traction in tractions.values():
         load = load + assembly.nodal_areas(points, facets)[:, None] * traction[None, :]
-    return _Values(
+    values = _Values(
         mass=assembly.assemble(pattern, density[:, None, None, None, None] * l2_blocks),
         stiffness=isotropic(material.elastic_lame()),
         viscosity=None if is_elastic else isotropic(material.viscous_lame()),
@@ -246,6 +248,8 @@ def _assemble(
         nodal_mass=assembly.assemble(all_nodes, l2_blocks),
         load=load,
     )
+    # Concrete values were checked before; traced ones cannot raise.
+    return poison_unless(is_admissible(material) & jnp.all(volumes > 0.0), values)
 
 
 def _check_dtype(dtype) -> None:
