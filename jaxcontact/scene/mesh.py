@@ -25,14 +25,9 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-__all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
+from jaxcontact.scene.cells import boundary_facets, cell_volumes, components, facet_keys
 
-# Facet i of a cell is the one opposite its vertex i, oriented outward.
-_LOCAL_FACETS = {
-    1: ((1,), (0,)),
-    2: ((1, 2), (2, 0), (0, 1)),
-    3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)),
-}
+__all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
 
 
 @jax.tree_util.register_dataclass
@@ -132,78 +127,13 @@ class Mesh:
         """Number of cells E."""
         return self.cells.shape[0]
 
+    def components(self) -> np.ndarray:
+        """The connected part of each node, (N,) int32, numbered from 0 on by their first nodes.
 
-def cell_volumes(points: Any, cells: np.ndarray) -> Any:
-    """Signed volume det(x_1 - x_0, ..., x_d - x_0) / d! of every cell.
-
-    Args:
-        points: Node positions, (N,d) [m], NumPy or JAX (the result is of the same kind).
-        cells: Node indices, (E,d+1).
-
-    Returns:
-        Length, area or volume of the cells, (E,) [m^d]; negative for inverted cells.
-    """
-    d = points.shape[1]
-    edges = [points[cells[:, i]] - points[cells[:, 0]] for i in range(1, d + 1)]
-    determinant = _determinant([[edge[:, j] for j in range(d)] for edge in edges])
-    return determinant / math.factorial(d)
-
-
-def _determinant(rows: list[list[Any]]) -> Any:
-    """Laplace expansion along the first row; the entries are arrays of one shape."""
-    if len(rows) == 1:
-        return rows[0][0]
-    minors = [[row[:j] + row[j + 1 :] for row in rows[1:]] for j in range(len(rows))]
-    return sum((-1) ** j * rows[0][j] * _determinant(minor) for j, minor in enumerate(minors))
-
-
-def boundary_facets(cells: np.ndarray) -> np.ndarray:
-    """The facets that belong to exactly one cell, oriented outward.
-
-    Args:
-        cells: Node indices of positively oriented cells, (E,d+1).
-
-    Returns:
-        Node indices, (B,d) int32, in the order of the cells.
-
-    Raises:
-        ValueError: A facet belongs to more than two cells.
-    """
-    d = cells.shape[1] - 1
-    facets = cells[:, np.array(_LOCAL_FACETS[d])].reshape(-1, d)  # (E,d+1,d) -> (E(d+1),d)
-    keys = facet_keys(facets, int(cells.max()) + 1)
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    counts = np.diff(np.r_[starts, len(keys)])
-    if (counts > 2).any():
-        crowded = facets[order[starts[counts > 2]]]
-        raise ValueError(
-            f"{len(crowded)} facets belong to more than two cells, the first is "
-            f"{crowded[0].tolist()}: remove duplicate or overlapping cells"
-        )
-    return facets[np.sort(order[starts[counts == 1]])].astype(np.int32)
-
-
-def facet_keys(facets: np.ndarray, n_nodes: int) -> np.ndarray:
-    """One number per facet that does not depend on the order of its nodes.
-
-    Args:
-        facets: Node indices in [0, n_nodes), (F,d).
-        n_nodes: Number of nodes; facets to be compared need the same.
-
-    Returns:
-        Keys, (F,) int64.
-
-    Raises:
-        ValueError: 64 bits do not suffice (from two million nodes on in 3D).
-    """
-    if n_nodes ** facets.shape[1] >= 2**63:
-        raise ValueError(f"{n_nodes} nodes are too many for 64-bit facet keys: coarsen the mesh")
-    keys = np.zeros(len(facets), dtype=np.int64)
-    for column in np.sort(facets, axis=1).T:
-        keys = keys * n_nodes + column
-    return keys
+        A mesh of several bodies has several. A body that should be one has too, if its parts do
+        not share the nodes at which they meet; merge these, or the parts move independently.
+        """
+        return components(self.cells, self.n_nodes)
 
 
 def _match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:
