@@ -5,28 +5,48 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import warnings
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcontact.scene.mesh import Mesh, boundary_facets, cell_volumes, facet_keys
+from jaxcontact.scene.abaqus import read_deck
+from jaxcontact.scene.cells import boundary_facets, cell_volumes
+from jaxcontact.scene.file_groups import SIMPLICES, boundary_groups, cell_groups, node_groups
+from jaxcontact.scene.mesh import Mesh
+
+if TYPE_CHECKING:
+    import meshio
 
 __all__ = ["read_mesh"]
 
-_SIMPLICES = {0: "vertex", 1: "line", 2: "triangle", 3: "tetra"}
+#: What to do about words with which meshio refuses a file.
+_ADVICE = {
+    "parametric nodes": "save it without parametric coordinates (Gmsh: Mesh.SaveParametric=0)",
+    "out of bounds": "its cells name nodes that it does not have: write it again",
+    "Incompatible cell data 'gmsh:": (
+        "some of its elements are in no physical group: put them into one, or save the groups "
+        "only (Gmsh: Mesh.SaveAll=0) or in the older format (gmsh -format msh22)"
+    ),
+}
 
 
 def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> Mesh:
     """Read the simplices of the highest dimension in a file, with its named groups.
 
     Holds afterwards: nodes that no cell uses are gone, constant trailing coordinates of line and
-    planar meshes are dropped, and inverted cells are turned over. Gmsh physical groups and the cell
-    sets of the file (Abaqus and others) become facet sets where they hold facets and regions where
-    they hold cells; a physical group without a name is called by its number. Groups with
-    facets that are not on the boundary are left out with a warning.
+    planar meshes are dropped, and inverted cells are turned over.
+
+    Named groups become facet sets where they hold facets and regions where they hold cells:
+
+    - Gmsh physical groups, and the sets of elements and surfaces of Abaqus and others, by name;
+    - sets of nodes by name, as the boundary facets that have all their nodes in the set;
+    - groups that only have a number (Gmsh, Medit, SU2, TetGen) by that number, such as "7";
+    - integer cell data of other formats (VTK, VTU) by array and number, such as "mat_id:7".
+
+    Facets off the boundary, sets of nodes without a facet, and arrays of more than 256 numbers
+    are left out with a warning. Parts that share no nodes are several bodies: see
+    `Mesh.components`.
 
     Args:
         path: The file; its ending tells the format.
@@ -39,57 +59,58 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
         OSError: The file cannot be opened.
         ImportError: The format needs another package, as XDMF and MED need h5py.
         ValueError: The file cannot be read as a mesh, has no simplices of this dimension, has other
-            cells of this dimension, is a curved or tilted surface or curve, or holds a mesh that
-            `Mesh.from_arrays` refuses.
+            cells of this dimension, names nodes that it does not have, lacks the cells of the
+            body, is a curved or tilted surface or curve, or holds a mesh that `Mesh.from_arrays`
+            refuses.
     """
-    source = _read(Path(path))
+    path = Path(path)
+    source = _read(path)
     d = dimension if dimension is not None else max((b.dim for b in source.cells), default=0)
     if d not in (1, 2, 3):
         raise ValueError(
             f"{path}: dimension is {d}, but must be 1, 2 or 3; the file has {_contents(source)}"
         )
-    others = sorted({b.type for b in source.cells if b.dim == d and b.type != _SIMPLICES[d]})
+    others = sorted({b.type for b in source.cells if b.dim == d and b.type != SIMPLICES[d]})
     if others:
         raise ValueError(
             f"{path}: cells of type {', '.join(others)} are not linear simplices; split them into "
-            f"{_SIMPLICES[d]} cells or mesh again (Gmsh: -order 1 and no recombination)"
+            f"{SIMPLICES[d]} cells or mesh again (Gmsh: -order 1 and no recombination)"
         )
-    corners = _simplices(source, d)
+    if dimension is None and d < _gmsh_dimension(path):
+        raise ValueError(
+            f"{path}: the model has dimension {_gmsh_dimension(path)}, but the file has only "
+            f"{_contents(source)}, since the body is in no physical group; put it into one, or "
+            f"read the {SIMPLICES[d]} cells with dimension={d}"
+        )
+    corners = _simplices(path, source, d)
     if not len(corners):
         raise ValueError(
-            f"{path}: no {_SIMPLICES[d]} cells; the file has {_contents(source)}: choose another "
+            f"{path}: no {SIMPLICES[d]} cells; the file has {_contents(source)}: choose another "
             "dimension= or save the cells of the body too"
         )
+    regions = cell_groups(path, source, d)
+    if "gmsh:physical" in source.cell_data:
+        corners, regions = _once(corners, regions)
     used, cells = np.unique(corners, return_inverse=True)
     points = _drop_flat_axes(path, np.asarray(source.points, dtype=np.float64)[used], d)
     cells = _turn_over(points, cells.reshape(corners.shape))
     number = np.full(len(source.points), -1)
     number[used] = np.arange(len(used))
-    facets = number[_simplices(source, d - 1)]
-    on_boundary = np.isin(
-        facet_keys(facets + 1, len(used) + 1),
-        facet_keys(boundary_facets(cells) + 1, len(used) + 1),
+    boundary = boundary_facets(cells)
+    # Facets that are named as such go before those that a set of nodes encloses.
+    facet_sets = node_groups(path, source, number, boundary) | boundary_groups(
+        path, cell_groups(path, source, d - 1), number[_simplices(path, source, d - 1)], boundary
     )
-    facet_sets = {}
-    for name, group in _groups(source, d - 1).items():
-        n_inside = np.count_nonzero(~on_boundary[group])
-        if n_inside:
-            warnings.warn(
-                f"{path}: group {name!r} is left out, {n_inside} of its {len(group)} facets are "
-                "not on the boundary of the mesh",
-                stacklevel=2,
-            )
-        else:
-            _, first = np.unique(facet_keys(facets[group], len(used)), return_index=True)
-            facet_sets[name] = facets[group[np.sort(first)]]
-    return Mesh.from_arrays(points, cells, facet_sets, _groups(source, d))
+    return Mesh.from_arrays(points, cells, facet_sets, regions)
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path) -> meshio.Mesh:
     """The meshio mesh in a file; a file that does not parse becomes a ValueError."""
     # Here and not above: its import takes longer than that of this package without JAX.
     import meshio
 
+    if path.suffix.lower() == ".inp":
+        return read_deck(path)
     with path.open("rb"):
         pass
     # meshio prints why a format did not fit and, when none is left, ends the interpreter.
@@ -101,52 +122,64 @@ def _read(path: Path) -> Any:
         raise
     except (Exception, SystemExit) as error:
         reason = " ".join(said.getvalue().split()) or repr(error)
-        raise ValueError(
-            f"{path}: meshio cannot read this file ({reason}); check that its ending tells the "
-            "format, or convert it with `meshio convert`"
-        ) from error
+        advice = [text for words, text in _ADVICE.items() if words in reason] or [
+            "check that its ending tells the format, or convert it with `meshio convert`"
+        ]
+        raise ValueError(f"{path}: meshio cannot read this file ({reason}); {advice[0]}") from error
 
 
-def _contents(source: Any) -> str:
+def _gmsh_dimension(path: Path) -> int:
+    """The dimension of the geometry that a Gmsh file of format 4 describes; 0 for other files."""
+    content = path.read_bytes() if path.suffix.lower() == ".msh" else b""
+    header = content[: content.find(b"$EndMeshFormat")].split()
+    start = content.find(b"$Entities")
+    if start < 0 or len(header) < 4:
+        return 0
+    _, entities = content[start : start + 200].split(b"\n", 1)
+    is_binary, size = header[2] == b"1", int(header[3])
+    counts = np.frombuffer(entities, f"u{size}", 4) if is_binary else entities.split()[:4]
+    return max((d for d in range(4) if int(counts[d])), default=0)
+
+
+def _once(
+    cells: np.ndarray, regions: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The cells with each once, and the regions; Gmsh repeats a cell for each of its groups."""
+    _, first, inverse = np.unique(
+        np.sort(cells, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    kept = np.sort(first)
+    renumbered = np.searchsorted(kept, first[inverse.ravel()])
+    return cells[kept], {name: np.unique(renumbered[rows]) for name, rows in regions.items()}
+
+
+def _contents(source: meshio.Mesh) -> str:
     counts = {}
     for block in source.cells:
         counts[block.type] = counts.get(block.type, 0) + len(block.data)
     return ", ".join(f"{n} {kind} cells" for kind, n in counts.items()) or "no cells"
 
 
-def _simplices(source: Any, dimension: int) -> np.ndarray:
+def _simplices(path: Path, source: meshio.Mesh, dimension: int) -> np.ndarray:
     """Node indices of all simplices of this dimension, in the file's order, (.,d+1)."""
-    blocks = [block.data for block in source.cells if block.type == _SIMPLICES[dimension]]
-    return np.concatenate([np.zeros((0, dimension + 1), np.int64), *blocks]).astype(np.int64)
+    blocks = [block.data for block in source.cells if block.type == SIMPLICES[dimension]]
+    rows = np.concatenate([np.zeros((0, dimension + 1), np.int64), *blocks]).astype(np.int64)
+    outside = np.flatnonzero(((rows < 0) | (rows >= len(source.points))).any(axis=1))
+    if outside.size:
+        raise ValueError(
+            f"{path}: {outside.size} {SIMPLICES[dimension]} cells name nodes that are not in the "
+            f"file, the first {rows[outside[0]].tolist()} of nodes 0 to {len(source.points) - 1}; "
+            "write the file again"
+        )
+    return rows
 
 
-def _groups(source: Any, dimension: int) -> Mapping[str, np.ndarray]:
-    """Rows of `_simplices(source, dimension)` in each named group that has any."""
-    names = {tag: name for name, (tag, d) in source.field_data.items() if d == dimension}
-    tags = source.cell_data.get("gmsh:physical")
-    groups: dict[str, list[np.ndarray]] = {}
-    start = 0
-    for i, block in enumerate(source.cells):
-        if block.type != _SIMPLICES[dimension]:
-            continue
-        if tags is not None:
-            # Gmsh gives the number 0 to elements of no physical group.
-            for tag in np.unique(tags[i][tags[i] != 0]):
-                rows = np.flatnonzero(tags[i] == tag)
-                groups.setdefault(names.get(tag, str(tag)), []).append(start + rows)
-        for name, rows in source.cell_sets.items():
-            if rows[i] is not None and len(rows[i]) and not name.startswith("gmsh:"):
-                groups.setdefault(name, []).append(start + np.asarray(rows[i], dtype=np.int64))
-        start += len(block.data)
-    return {name: np.unique(np.concatenate(rows)) for name, rows in groups.items()}
-
-
-def _drop_flat_axes(path: Any, points: np.ndarray, d: int) -> np.ndarray:
+def _drop_flat_axes(path: Path, points: np.ndarray, d: int) -> np.ndarray:
     """The first d coordinates, after a check that the others are constant, (N,.) -> (N,d)."""
     extent = np.ptp(points, axis=0)
     if (extent[d:] > 1e-10 * extent.max()).any():
         raise ValueError(
-            f"{path}: the {_SIMPLICES[d]} cells extend by {extent.tolist()} along the axes, but a "
+            f"{path}: the {SIMPLICES[d]} cells extend by {extent.tolist()} along the axes, but a "
             f"mesh of dimension {d} must lie flat in the first {d} coordinates: turn it, or mesh "
             "the volume"
         )

@@ -86,7 +86,8 @@ def test_read_mesh_returns_the_mesh_that_was_written(tmp_path, ending, name):
     assert np.array_equal(again.cells, mesh.cells)
     np.testing.assert_allclose(again.points, mesh.points, atol=1e-15)
     assert again.facets == {}
-    assert again.regions == {}
+    # Medit numbers every cell, and meshio writes the number 1.
+    assert [*again.regions] == (["1"] if ending == "mesh" else [])
 
 
 def test_read_mesh_names_facet_sets_and_regions_by_gmsh_physical_groups(tmp_path):
