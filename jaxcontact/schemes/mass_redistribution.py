@@ -7,7 +7,8 @@ E replaces the normal velocity of a contact node by that of the body just inside
 offset, sum_j w_ij (I - nu nu^T)(x_j - x_i) ~ 0. E^T M E is positive semidefinite with the kernel
 N^T and the total mass of M, but it moves the centre of mass by O(h^2). C, one small block on each
 node inside, is the smallest correction that gives every rigid velocity field (1D: every affine
-one) its kinetic energy back: total mass, centre of mass and inertia are then those of M.
+one) of every body its kinetic energy back: mass, centre of mass and inertia of each connected part
+of the mesh are then those of M.
 
 Extrapolating affine fields exactly (w with sum_j w_ij x_j = x_i) needs no C, but puts 8/3 of a
 cell's mass on the first node of a bar, which rings after an impact: three times the error of the
@@ -25,10 +26,18 @@ from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jax import Array
 from jax.core import Tracer
+from scipy.sparse.csgraph import connected_components
 
-from jaxcontact.system.block_matrix import BlockMatrix, from_symmetric, on_host, scatter
+from jaxcontact.system.block_matrix import (
+    BlockMatrix,
+    concatenate,
+    from_symmetric,
+    on_host,
+    scatter,
+)
 from jaxcontact.system.system import System
 
 #: How dear a tangential offset of a donor is, against a distant donor.
@@ -104,18 +113,51 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
 
 
 def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
-    """Return C: blocks m_i R_i T R_i^T on the nodes inside, with R_i the rigid fields at node i.
+    """Return C, which gives every body of the mesh its own moments back."""
+    body = _bodies(system)[np.asarray(system.free_nodes)]
+    is_inside = ~np.isin(np.asarray(system.free_nodes), np.asarray(system.contact_nodes))
+    lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
+    corrections = [
+        _body_correction(system, lost, body == number, is_inside)
+        for number in np.unique(body[~is_inside])
+    ]
+    nodes = np.concatenate([correction.rows for correction in corrections])
+    blocks = concatenate(*(correction.blocks for correction in corrections))
+    return BlockMatrix(nodes, nodes, blocks)
+
+
+def _bodies(system: System) -> np.ndarray:
+    """Return the number of the connected part of the mesh to which each node belongs, (N,)."""
+    columns = np.asarray(system.nodal_mass.columns)
+    rows = np.broadcast_to(np.arange(system.n_nodes), columns.shape)
+    edges = (np.ones(columns.size, np.int8), (rows.ravel(), columns.ravel()))
+    graph = scipy.sparse.coo_array(edges, shape=(system.n_nodes, system.n_nodes))
+    return connected_components(graph, directed=False)[1]
+
+
+def _body_correction(
+    system: System, lost: BlockMatrix, is_body: np.ndarray, is_inside: np.ndarray
+) -> BlockMatrix:
+    """Return blocks m_i R_i T R_i^T on the inner nodes i of a body, R_i its rigid fields there.
 
     T solves sum_i m_i R_i^T R_i T R_i^T R_i = R^T (M - E^T M E) R, with the nodal volumes m_i.
+
+    Args:
+        system: the system.
+        lost: M - E^T M E on the free nodes.
+        is_body: free nodes of the body, (n,).
+        is_inside: free nodes without contact, (n,).
     """
-    free = np.asarray(system.free_nodes)
-    inside = np.flatnonzero(~np.isin(free, np.asarray(system.contact_nodes)))
-    fields = _rigid_fields(on_host(system.points)[free])  # (n, i, k)
-    lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
-    columns = fields[lost.columns]
-    missing = (fields[lost.rows].swapaxes(1, 2) @ lost.blocks @ columns).sum(axis=0)
+    free, nodes = np.asarray(system.free_nodes), np.flatnonzero(is_body)
+    position = np.cumsum(is_body) - 1
+    fields = _rigid_fields(on_host(system.points)[free[nodes]])  # (n, i, k)
+    entries = np.flatnonzero(is_body[lost.rows])
+    left = fields[position[lost.rows[entries]]].swapaxes(1, 2)
+    right = fields[position[lost.columns[entries]]]
+    missing = (left @ on_host(lost.blocks)[entries] @ right).sum(axis=0)
+    inside = np.flatnonzero(is_body & is_inside)
     volumes = on_host(system.nodal_mass.values).sum(axis=0)[free[inside]]
-    rigid = fields[inside]
+    rigid = fields[position[inside]]
     gram = rigid.swapaxes(1, 2) @ rigid
     k = gram.shape[1]
     flat = gram.reshape(-1, k * k)
