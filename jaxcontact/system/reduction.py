@@ -66,7 +66,7 @@ def reduce(system: System, modes: int, *, contact_responses: bool = True) -> Sys
         stiffness=project(system.stiffness),
         viscosity=None if system.viscosity is None else project(system.viscosity),
         l2_mass=project(system.l2_mass),
-        normals=ContactNormals(normals, unknowns),
+        normals=ContactNormals(normals, unknowns, V.shape[1]),
         load=system.load @ V,
         basis=Basis(V, system.mass @ V),
     )
@@ -89,7 +89,7 @@ def _basis(system: System, modes: int, contact_responses: bool) -> np.ndarray:
     )
     vectors = vibrations
     if contact_responses and system.normals.count:
-        responses = solve(system.normals.to_scipy(system.size).T.toarray())
+        responses = solve(system.normals.to_scipy().T.toarray())
         vectors = np.concatenate([vibrations, responses], axis=1)
     vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
     # The square roots of the Gram matrix's eigenvalues are singular values in the M norm.

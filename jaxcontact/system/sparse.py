@@ -159,6 +159,9 @@ class ContactNormals:
     unknowns: Array | np.ndarray
     """Unknown of each entry, (C, k) int32."""
 
+    size: int | None = field(default=None, metadata={"static": True})
+    """Number of all unknowns, n; None where it does not matter."""
+
     @property
     def count(self) -> int:
         """Number of contact pairs, C."""
@@ -173,9 +176,16 @@ class ContactNormals:
         contributions = self.weights * multiplier[:, None]
         return jnp.zeros(size, contributions.dtype).at[self.unknowns].add(contributions)
 
-    def to_scipy(self, size: int) -> scipy.sparse.csr_array:
-        """Return a SciPy CSR copy of shape (C, size) (concrete operators only)."""
+    def to_scipy(self, size: int | None = None) -> scipy.sparse.csr_array:
+        """Return a SciPy CSR copy of shape (C, size), of a system (C, n) (concrete operators only).
+
+        Raises:
+            ValueError: if the number of unknowns is given neither here nor in `size`.
+        """
+        n_columns = self.size if size is None else size
+        if n_columns is None:
+            raise ValueError("this operator does not know its number of unknowns: pass to_scipy(n)")
         unknowns = np.asarray(self.unknowns)
         rows = np.broadcast_to(np.arange(self.count)[:, None], unknowns.shape)
         entries = (np.asarray(self.weights).ravel(), (rows.ravel(), unknowns.ravel()))
-        return scipy.sparse.coo_array(entries, shape=(self.count, size)).tocsr()
+        return scipy.sparse.coo_array(entries, shape=(self.count, n_columns)).tocsr()

@@ -7,7 +7,7 @@ on the n unknowns: the displacement components of the nodes that are not clamped
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from jaxcontact.scene.material import KelvinVoigt, is_admissible
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
@@ -22,7 +23,7 @@ from jaxcontact.system import assembly
 from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
-from jaxcontact.transforms.traced import poison_unless
+from jaxcontact.transforms.traced import as_array, poison_unless
 
 
 @jax.tree_util.register_dataclass
@@ -108,6 +109,21 @@ class System:
         """Floating point type of every array."""
         return self.load.dtype
 
+    def with_gap(self, gap: ArrayLike) -> System:
+        """Return the system with another initial gap of the contact pairs, (C,) [m].
+
+        Raises:
+            ValueError: if the gap has another shape.
+
+        Derivative: the identity from the argument to the field `gap`.
+        """
+        gap = as_array(gap)
+        if gap.shape != self.gap.shape:
+            raise ValueError(
+                f"gap has shape {gap.shape}; pass {self.gap.shape}, one for each of `contact_nodes`"
+            )
+        return replace(self, gap=jnp.asarray(gap, self.dtype))
+
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
         return _lift(self, x)
@@ -188,7 +204,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(pairs.normals, unknowns),
+        normals=ContactNormals(pairs.normals, unknowns, dimension * free_nodes.size),
         gap=pairs.gap,
         load=values.load[free_nodes].reshape(-1),
         contact_nodes=pairs.nodes,

@@ -143,7 +143,7 @@ def test_system_equals_the_independently_assembled_one():
         scale = np.max(np.abs(theirs))
         np.testing.assert_allclose(ours.to_scipy().toarray(), theirs, atol=ROUNDING * scale)
     np.testing.assert_array_equal(system.contact_nodes, nodes)
-    np.testing.assert_allclose(system.normals.to_scipy(system.size).toarray(), body.normals)
+    np.testing.assert_allclose(system.normals.to_scipy().toarray(), body.normals)
     np.testing.assert_allclose(system.gap, body.gap, rtol=ROUNDING)
 
 
@@ -243,6 +243,57 @@ def test_equal_regions_are_one_material():
         np.testing.assert_allclose(ours, theirs, rtol=ROUNDING)
 
 
+def test_material_per_cell_is_that_of_its_regions():
+    soft = jc.KelvinVoigt(young=1.0, poisson=0.1)
+    stiff = jc.KelvinVoigt(young=10.0, poisson=0.1, density=3.0, shear_viscosity=1.0)
+    regions = jc.discretize(two_halves(soft, stiff))
+    cellwise = jc.KelvinVoigt(
+        young=[1.0, 1.0, 10.0, 10.0],
+        poisson=0.1,
+        density=jnp.array([1.0, 1.0, 3.0, 3.0]),
+        shear_viscosity=np.array([0.0, 0.0, 1.0, 1.0]),
+    )
+    system = jc.discretize(jc.Scene(SMALL_MESHES[1], cellwise, clamped=("left",)))
+    for name in ("mass", "stiffness", "viscosity"):
+        ours, theirs = (getattr(s, name).to_scipy().toarray() for s in (system, regions))
+        np.testing.assert_allclose(ours, theirs, rtol=ROUNDING)
+
+
+def test_material_per_cell_has_a_derivative_by_each_cell():
+    mesh = SMALL_MESHES[2]
+    field, gradient = linear_field(mesh)
+    field = jnp.asarray(field.ravel())
+
+    def energy(young):
+        material = jc.KelvinVoigt(young=young, poisson=0.0)
+        return jnp.dot(field, jc.discretize(jc.Scene(mesh, material)).stiffness @ field)
+
+    strain = (gradient + gradient.T) / 2
+    # Cells are right triangles with legs of 1/2, the energy density is young times strain squared.
+    expected = np.full(mesh.n_cells, np.sum(strain**2) / 8)
+    found = jax.jit(jax.grad(energy))(jnp.linspace(1.0, 2.0, mesh.n_cells))
+    np.testing.assert_allclose(found, expected, rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("young", "message"),
+    [
+        (np.ones(3), r"scalar or have one value per cell, \(4,\), got shape \(3,\).*region"),
+        ([1.0, -2.0, 1.0, 0.0], r"young must be positive, got -2.0 in 2 cells, first \[1, 3\]"),
+    ],
+)
+def test_material_per_cell_that_does_not_fit_is_named(young, message):
+    material = jc.KelvinVoigt(young=young, poisson=0.3)
+    with pytest.raises(ValueError, match=message):
+        jc.discretize(jc.Scene(SMALL_MESHES[1], material))
+
+
+def test_material_of_a_region_is_a_scalar():
+    cellwise = jc.KelvinVoigt(young=np.ones(4), poisson=0.3)
+    with pytest.raises(ValueError, match=r"must be a scalar, got shape \(4,\)"):
+        jc.discretize(two_halves(cellwise, MATERIAL))
+
+
 def test_system_without_viscosity_assembles_none():
     elastic = jc.KelvinVoigt(young=1.0, poisson=0.3)
     assert jc.discretize(jc.Scene(SMALL_MESHES[2], elastic)).viscosity is None
@@ -316,6 +367,28 @@ def test_contact_normals_act_on_the_unknowns_of_their_node():
     field = np.random.default_rng(0).normal(size=(SMALL_MESHES[2].n_nodes, 2))
     found = system.normals @ system.restrict(jnp.asarray(field))
     np.testing.assert_allclose(found, -field[system.contact_nodes, 1], rtol=ROUNDING)
+
+
+def test_contact_normals_of_a_system_know_its_unknowns():
+    floor = jc.HalfSpace(np.array([0.0, -1.0]), np.array([0.0, 1.0]))
+    scene = jc.Scene(SMALL_MESHES[2], MATERIAL, clamped=("top",), contact={"bottom": floor})
+    system = jc.discretize(scene)
+    assert system.normals.to_scipy().shape == (5, system.size)
+
+
+def test_system_with_another_gap_changes_nothing_else():
+    system = contact_system(jc.HalfSpace(np.array([0.0, -1.0]), np.array([0.0, 1.0])))
+    moved = system.with_gap(np.full(5, 0.25))
+    np.testing.assert_array_equal(moved.gap, 0.25)
+    for ours, theirs in zip(
+        jax.tree.leaves(moved.with_gap(system.gap)), jax.tree.leaves(system), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(
+        jax.jacobian(lambda g: system.with_gap(g).gap)(system.gap), np.eye(5)
+    )
+    with pytest.raises(ValueError, match=r"gap has shape \(\); pass \(5,\), one for each"):
+        system.with_gap(0.25)
 
 
 def test_contact_corner_in_two_sets_makes_two_pairs():

@@ -38,6 +38,7 @@ def test_reduce_is_the_galerkin_projection(problem):
     np.testing.assert_allclose(
         reduced.stiffness.values, expected, atol=ROUNDING * np.abs(expected).max()
     )
+    assert reduced.normals.to_scipy().shape == (reduced.normals.count, reduced.size)
     y = jnp.linspace(0.0, 1.0, V.shape[1])
     np.testing.assert_allclose(reduced.normals @ y, full.normals @ (V @ y), atol=ROUNDING)
 

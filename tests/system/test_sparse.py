@@ -233,3 +233,8 @@ def test_componentwise_matrix_is_the_kronecker_product_with_the_identity(d):
     np.testing.assert_array_equal(matrix.to_scipy().toarray(), dense)
     np.testing.assert_array_equal(matrix.diagonal(), np.diagonal(dense))
     np.testing.assert_array_equal((matrix + matrix.expand()).to_dense(), 2.0 * dense)
+
+
+def test_contact_normals_ask_for_a_size_that_nobody_told():
+    with pytest.raises(ValueError, match=r"pass to_scipy\(n\)"):
+        random_normals().to_scipy()
