@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,8 +83,8 @@ def write_time_series(
         file = folder / f"{path.stem}_{level:0{len(str(steps))}d}.vtu"
         _write_level(file, mesh, fields, level)
         files.append(file)
-        place = f"{folder.name}/{file.name}"
-        entries.append(f'    <DataSet timestep="{time[level]:.12g}" part="0" file="{place}"/>')
+        place = quoteattr(f"{folder.name}/{file.name}")
+        entries.append(f'    <DataSet timestep="{time[level]:.12g}" part="0" file={place}/>')
     path.write_text(
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
         + "\n".join(entries)

@@ -109,6 +109,13 @@ def test_time_series_of_a_bar_has_lines_and_three_components(tmp_path):
     assert read.points.shape == read.point_data["velocity"].shape == (5, 3)
 
 
+@pytest.mark.parametrize("name", ["a & b", "h<1", 'the "new" one', "it's", "größer"])
+def test_time_series_of_any_name_is_well_formed(tmp_path, name):
+    files = write_time_series(tmp_path / f"{name}.pvd", *bar_trajectory())
+    entries = ElementTree.parse(files[0]).findall(".//DataSet")
+    assert [tmp_path / entry.attrib["file"] for entry in entries] == files[1:]
+
+
 def test_time_series_leaves_other_files_alone(problem, trajectory, tmp_path):
     mine = tmp_path / "a" / "mine.vtu"
     mine.parent.mkdir()
