@@ -3,16 +3,19 @@
 With T steps, K = T / save_every recorded states and S segments of a checkpoint, in numbers:
 
     trajectory    K (2 N d + n)              displacement, velocity, and the unknowns they are of
+                  K N d                      in a gradient, of which the cost reads displacements
     residuals     T C / 8                    one boolean per pair and step: loads, initial state
                   T (5 n + 3 C)              if matrices are differentiated (y, v, w, ...)
     checkpoint    (T / S) (...) + 2 S n      residuals of one segment, and the start of each
-    cotangents    K N d + T N d              of the recorded displacement and of the control
+    cotangents    K N d + T N d              of the recorded displacement and of the control, this
+                                             twice where a checkpoint cuts blocks of save_every
 
 The factors are those of the compiled programs; the prediction holds within a factor of two.
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -36,7 +39,7 @@ class MemoryEstimate:
     """Matrices and factor; an argument of the run."""
 
     trajectory: int
-    """Recorded states and contact records."""
+    """Recorded states and contact records; in a gradient, what a cost of displacements reads."""
 
     residuals: int
     """What the steps keep for the backward pass, states at checkpoints included."""
@@ -95,10 +98,12 @@ def estimate_memory(
     field = item * system.n_nodes * system.dimension
     n_records = steps // save_every
 
-    trajectory = (n_records + 1) * (2 * field + vector + pairs + item)
+    is_gradient = gradient or matrix_gradient
+    kept = field if is_gradient else 2 * field + vector
+    trajectory = (n_records + 1) * (kept + pairs + item)
     trajectory += steps * (pairs + 2 * n_pairs + 8 + item)
     residuals = cotangents = 0
-    if gradient or matrix_gradient:
+    if is_gradient:
         per_step = n_pairs + item
         if matrix_gradient:
             per_step += MATRIX_RESIDUALS[0] * vector + MATRIX_RESIDUALS[1] * pairs
@@ -109,8 +114,8 @@ def estimate_memory(
             length = -(-n_records // segments) * save_every
             residuals = length * per_step + segments * (2 * vector + pairs + n_pairs)
     if gradient:
-        # A checkpoint rearranges the control by segments: a second copy.
-        cotangents += steps * field * (1 if checkpoint is None else 2)
+        # A checkpoint rearranges the control by segments of blocks: a second copy.
+        cotangents += steps * field * (1 if checkpoint is None or save_every == 1 else 2)
     if matrix_gradient:
         cotangents += _float_bytes(system)
     return MemoryEstimate(
@@ -120,6 +125,42 @@ def estimate_memory(
         cotangents=cotangents,
         workspace=WORKSPACE_VECTORS * vector,
     )
+
+
+def check_run_memory(
+    stepper: Stepper, steps: int, *, save_every: int = 1, available: int | None = None
+) -> None:
+    """Check that the states of a run have room, before JAX asks the machine for it.
+
+    Args:
+        stepper: from `prepare`; may be traced.
+        steps: number of steps T.
+        save_every: as in `simulate`.
+        available: bytes that there are; None is the memory of all devices, if it is known.
+
+    Raises:
+        ValueError: if the predicted trajectory is more than twice what is available, or as
+            `estimate_memory`.
+    """
+    needed = estimate_memory(stepper, steps, save_every=save_every).trajectory
+    available = _device_memory() if available is None else available
+    # Twice: the prediction holds within this factor.
+    if available is not None and needed > 2 * available:
+        raise ValueError(
+            f"{steps} steps record about {_readable(needed)} of states, but there are "
+            f"{_readable(available)} of memory; record fewer by a larger save_every "
+            f"(now {save_every}), or simulate in pieces, each from the last state of the one before"
+        )
+
+
+def _device_memory() -> int | None:
+    """Return the bytes of the memory of all devices, or None if that is not known."""
+    stats = [device.memory_stats() for device in jax.local_devices()]
+    if all(entry and "bytes_limit" in entry for entry in stats):
+        return sum(entry["bytes_limit"] for entry in stats if entry)
+    if jax.default_backend() == "cpu" and hasattr(os, "sysconf"):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
 
 
 def _bytes(tree: Any) -> int:
@@ -133,8 +174,8 @@ def _float_bytes(tree: Any) -> int:
 
 
 def _readable(n_bytes: float) -> str:
-    for unit in ("B", "kB", "MB"):
+    for unit in ("B", "kB", "MB", "GB"):
         if n_bytes < 1000:
             return f"{n_bytes:.3g} {unit}"
         n_bytes /= 1000
-    return f"{n_bytes:.3g} GB"
+    return f"{n_bytes:.3g} TB"

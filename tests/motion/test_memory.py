@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
-from jaxcontact.motion.memory import estimate_memory
+from jaxcontact.motion.memory import check_run_memory, estimate_memory
 
 #: The promise of `estimate_memory`.
 FACTOR = 2.0
@@ -47,8 +47,12 @@ def final_misfit(trajectory):
         ("forward", 1, None),
         ("forward", 16, None),
         ("gradient", 1, None),
+        ("gradient", 1, jc.Checkpoint()),
+        ("gradient", 1, jc.Checkpoint(8)),
         ("gradient", 16, jc.Checkpoint(8)),
+        ("initial_gradient", 1, jc.Checkpoint(8)),
         ("matrix_gradient", 1, None),
+        ("matrix_gradient", 1, jc.Checkpoint(8)),
         ("matrix_gradient", 16, jc.Checkpoint(16)),
     ],
 )
@@ -58,11 +62,12 @@ def test_estimate_memory_is_within_a_factor_of_two(stepper, kind, save_every, ch
     system = stepper.system
     shape = (steps, system.n_nodes, system.dimension)
 
-    def run(stepper, control):
-        return jc.simulate(stepper, control, steps=steps, initial=throw(stepper.system), **options)
+    def run(stepper, control, initial=None):
+        initial = throw(stepper.system) if initial is None else initial
+        return jc.simulate(stepper, control, steps=steps, initial=initial, **options)
 
-    def misfit(stepper, control):
-        return jnp.sum(run(stepper, control).displacement ** 2)
+    def misfit(*arguments):
+        return jnp.sum(run(*arguments).displacement ** 2)
 
     if kind == "forward":
         used = compiled_bytes(run, stepper, None)
@@ -71,6 +76,10 @@ def test_estimate_memory_is_within_a_factor_of_two(stepper, kind, save_every, ch
         size = np.prod(shape) * system.dtype.itemsize
         gradient = jax.value_and_grad(misfit, argnums=1)
         used = compiled_bytes(gradient, stepper, control, without=size)
+    elif kind == "initial_gradient":
+        gradient = jax.value_and_grad(misfit, argnums=2)
+        used = compiled_bytes(gradient, stepper, None, throw(system))
+        kind = "gradient"
     else:
         gradient = jax.value_and_grad(misfit, allow_int=True)
         used = compiled_bytes(gradient, stepper, None)
@@ -136,3 +145,22 @@ def test_estimate_memory_reads_as_a_table(stepper):
 def test_estimate_memory_refuses_what_simulate_refuses(stepper, steps, save_every):
     with pytest.raises(ValueError, match="divisor"):
         estimate_memory(stepper, steps, save_every=save_every)
+
+
+def test_check_run_memory_refuses_a_run_that_no_machine_holds(stepper):
+    with pytest.raises(ValueError, match=r"TB of states.*larger save_every \(now 1\), or simulate"):
+        check_run_memory(stepper, 10**12)
+    check_run_memory(stepper, 1000)
+
+
+def test_check_run_memory_counts_the_states_that_are_recorded(stepper):
+    steps = 10_000
+    needed = estimate_memory(stepper, steps).trajectory
+    with pytest.raises(ValueError, match="save_every"):
+        check_run_memory(stepper, steps, available=needed // 3)
+    check_run_memory(stepper, steps, available=needed)
+    check_run_memory(stepper, steps, save_every=10, available=needed // 3)
+
+
+def test_check_run_memory_works_while_the_stepper_is_traced(stepper):
+    jax.eval_shape(lambda s: check_run_memory(s, 1000), stepper)
