@@ -29,10 +29,22 @@ class Checkpoint:
     segments: int | None = None
     """Number of segments; None is about the square root of the number of recorded states."""
 
+    def __post_init__(self) -> None:
+        """Check the number, which is never traced.
+
+        Raises:
+            ValueError: if it is not positive.
+        """
+        if self.segments is not None and self.segments < 1:
+            raise ValueError(
+                f"Checkpoint.segments must be 1 or more, got {self.segments}; leave it out for "
+                "about the square root of the number of recorded states"
+            )
+
     def count(self, n_blocks: int) -> int:
         """Return the number of segments for a number of recorded states."""
         wanted = math.isqrt(n_blocks - 1) + 1 if self.segments is None else self.segments
-        return max(1, min(wanted, n_blocks))
+        return min(wanted, n_blocks)
 
 
 def scan_steps(

@@ -52,3 +52,9 @@ def test_checkpoint_keeps_the_gradient(problem, segments):
 def test_simulate_refuses_a_save_every_that_does_not_divide(problem, save_every):
     with pytest.raises(ValueError, match="divisor"):
         jc.simulate(problem.stepper, problem.reference, save_every=save_every)
+
+
+@pytest.mark.parametrize("segments", [0, -3])
+def test_checkpoint_refuses_a_number_of_segments_that_is_not_positive(segments):
+    with pytest.raises(ValueError, match=f"must be 1 or more, got {segments}; leave it out"):
+        jc.Checkpoint(segments)
