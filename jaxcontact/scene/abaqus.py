@@ -106,7 +106,9 @@ class _Deck:
         for row in section.rows:
             self.numbers[int(row[0])] = len(self.points)
             ids.append(len(self.points))
-            self.points.append([float(x) for x in row[1:4]])
+            x = [float(entry) for entry in row[1:4] if entry]
+            # A coordinate that is left out is zero.
+            self.points.append(x + [0.0] * (3 - len(x)))
         if "NSET" in section.options:
             self._extend(self.node_sets, section, "NSET", ids)
 
@@ -119,7 +121,7 @@ class _Deck:
                 "with CPE3 or CPS3 triangles or C3D4 tetrahedra, and leave out other elements"
             )
         (shape,) = shapes
-        entries = np.array([int(x) for row in section.rows for x in row if x])
+        entries = np.array([int(x) for row in section.rows for x in row if x], dtype=np.int64)
         n_entries = len(_FACES[shape]) + 1
         if entries.size % n_entries:
             raise ValueError(f"type {kind} needs {n_entries} numbers per element: itself and nodes")
@@ -127,7 +129,7 @@ class _Deck:
         nodes = [tuple(self._number("node", int(k)) for k in row) for row in entries[:, 1:]]
         for row, (number, corners) in enumerate(zip(entries[:, 0], nodes, strict=True)):
             self.elements[int(number)] = _Element(shape, len(self.blocks), row, corners)
-        self.blocks.append((shape, np.array(nodes)))
+        self.blocks.append((shape, np.array(nodes, np.int64).reshape(-1, n_entries - 1)))
         if "ELSET" in section.options:
             self._extend(self.element_sets, section, "ELSET", entries[:, 0].tolist())
 

@@ -94,11 +94,11 @@ class SignedDistance:
 def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
     """Return the initial gap (C,) [m] and the unit normals towards the obstacle (C, d).
 
+    They are NaN if a wrong slope or radius is traced.
+
     Args:
         obstacle: the rigid obstacle.
         points: contact nodes in the reference configuration, (C, d) [m].
-
-    A wrong slope or radius that is traced makes the result NaN.
 
     Raises:
         ValueError: if the obstacle does not fit the dimension of the points, or has a normal or

@@ -159,5 +159,11 @@ def test_deck_that_is_missing_is_left_to_oserror(tmp_path):
         read_mesh(tmp_path / "nothing.inp")
 
 
+def test_deck_may_leave_out_zeros_and_have_empty_sections(tmp_path):
+    deck = SQUARE.replace("1, 0.0, 0.0", "1").replace("2, 1.0, 0.0", "2, 1.0,")
+    mesh = read(tmp_path, deck + "*ELEMENT, TYPE=S3\n")
+    assert np.array_equal(mesh.points, [[0, 0], [1, 0], [1, 1], [0, 1]])
+
+
 def test_deck_and_its_mesh_have_the_same_points(tmp_path):
     assert np.array_equal(read(tmp_path, SQUARE).points, [[0, 0], [1, 0], [1, 1], [0, 1]])
