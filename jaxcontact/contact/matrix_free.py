@@ -16,12 +16,12 @@ from jaxcontact.contact.complementarity import (
     Solution,
     Status,
 )
-from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.linear import ConstrainedFactor
 from jaxcontact.system.sparse import ContactNormals
 
 
 def solve_contact(
-    factor: IterativeFactor,
+    factor: ConstrainedFactor,
     max_steps: int,
     rhs: Array,
     bound: Array,
@@ -43,7 +43,7 @@ def solve_contact(
     """
     normals = factor.normals
     # Approximate compliance, for scaling only: it does not enter the solution.
-    compliance = jnp.mean(factor.preconditioner[normals.unknowns], axis=1)
+    compliance = factor.approximate_compliance
 
     def violation(w: Array) -> Array:
         return normals @ w - bound
@@ -55,7 +55,7 @@ def solve_contact(
     # The solver stops at a relative error, so gaps below it do not move a pair in or out.
     def advance(carry):
         active, _, _, _, steps = carry
-        w, p = factor.solve_on_set(active, rhs, bound)
+        w, p = factor.solve_constrained(active, rhs, bound)
         noise = resolution + RELATIVE_TOLERANCE[str(rhs.dtype)] * _magnitude(normals, w)
         stays = active & (compliance * p >= -noise)
         enters = ~active & (violation(w) > noise)

@@ -16,8 +16,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, solve_on_set
-from jaxcontact.linear import Factor
-from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.linear import Factor, can_condense
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -85,8 +84,8 @@ def solve_on_cone(
 
     def solve(_, data):
         r, b = data[:n], data[n:]
-        if isinstance(factor, IterativeFactor):
-            return jnp.concatenate(factor.solve_on_set(active, r, b))
+        if not can_condense(factor):
+            return jnp.concatenate(factor.solve_constrained(active, r, b))
         partial_sweep, free = factor.condense(r)
         p = solve_on_set(factor.compliance, active, frozen_softness, jnp.where(active, free - b, b))
         return jnp.concatenate([factor.expand(partial_sweep, jnp.where(active, p, 0.0)), p])

@@ -22,7 +22,7 @@ from jaxcontact.contact import critical_cone, matrix_free
 from jaxcontact.contact.complementarity import ContactSolver, Solution
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.weak import CriticalCone, OnBranch, WeakContact
-from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.linear import can_condense
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.forward_only import forward_only
 from jaxcontact.transforms.lasting_jvp import lasting_jvp
@@ -39,7 +39,7 @@ def _solve_forward(
     """Solve the VI; see `ContactProblem.solve`."""
     del weak_contact
     contact_solver, factor = fixed.contact_solver, fixed.factor
-    if isinstance(factor, IterativeFactor):
+    if not can_condense(factor):
         if not _is_exact(contact_solver, bound):
             raise ValueError(
                 f"ConjugateGradient cannot solve {type(contact_solver).__name__}; prepare with "
@@ -122,8 +122,8 @@ def _solve_critical_cone(
     normals = ContactNormals(weights, fixed.unknowns)
     strong = solution.active & (solution.multiplier > 0.0)
     weak = solution.active & ~strong
-    if isinstance(fixed.factor, IterativeFactor):
-        compliance = jnp.mean(fixed.factor.preconditioner[fixed.unknowns], axis=1)
+    if not can_condense(fixed.factor):
+        compliance = fixed.factor.approximate_compliance
     else:
         compliance = jnp.diagonal(fixed.factor.compliance)
 

@@ -29,7 +29,7 @@ from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, S
 from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
-from jaxcontact.linear.conjugate_gradient import IterativeFactor
+from jaxcontact.linear import can_condense
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -57,7 +57,7 @@ class ContactProblem:
     def first_guess(self) -> Guess:
         """Return where the first step starts: no pair is in contact."""
         nothing = jnp.zeros(self.normals.count, bool)
-        if self.normals.count == 0 or isinstance(self.factor, IterativeFactor):
+        if self.normals.count == 0 or not can_condense(self.factor):
             return Guess(nothing)
         return Guess(nothing, self.contact_solver.first_memory(self.factor.compliance))
 

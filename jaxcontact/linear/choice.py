@@ -1,14 +1,11 @@
 """Which linear solver a system gets when the user names none, and whether its factor fits.
 
 Measured: the dense inverse is no slower up to some 150 unknowns, nested dissection wins beyond, and
-conjugate gradients are for factors that do not fit in memory. The factor of a mesh of dimension d
-has about 9 n log2(n) entries for d <= 2 and 29 n^(4/3) for d = 3 (George 1973; the constants are
-measured).
+conjugate gradients are for factors that do not fit in memory.
 """
 
 from __future__ import annotations
 
-import math
 import os
 
 import jax
@@ -38,16 +35,9 @@ def choose_linear_solver(
     """
     if is_dense or size <= DENSE_LIMIT:
         return Dense()
-    if itemsize * dissection_entries(size, dimension) <= FACTOR_LIMIT:
-        return NestedDissection()
-    return ConjugateGradient()
-
-
-def dissection_entries(size: int, dimension: int) -> float:
-    """Return the estimated number of entries of a nested dissection factor."""
-    if dimension == 3:
-        return 29.0 * size ** (4.0 / 3.0)
-    return 9.0 * size * math.log2(max(size, 2))
+    dissection = NestedDissection()
+    is_small = dissection.bytes_needed(size, dimension, itemsize) <= FACTOR_LIMIT
+    return dissection if is_small else ConjugateGradient()
 
 
 def check_memory(solver: LinearSolver, size: int, dimension: int, itemsize: int) -> None:
@@ -56,13 +46,7 @@ def check_memory(solver: LinearSolver, size: int, dimension: int, itemsize: int)
     Raises:
         ValueError: if the estimated factor is larger than the available memory.
     """
-    if isinstance(solver, Dense):
-        # The matrix, its Cholesky factor and its inverse.
-        needed = 3.0 * itemsize * size**2
-    elif isinstance(solver, NestedDissection):
-        needed = itemsize * dissection_entries(size, dimension)
-    else:
-        return
+    needed = solver.bytes_needed(size, dimension, itemsize)
     available = available_memory()
     if available is not None and needed > available:
         raise ValueError(

@@ -22,6 +22,10 @@ from jax import Array
 
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
+#: Vectors (n,) that a solve keeps: preconditioner, right-hand side, lifted bound, iterate,
+#: residual, direction, its image and the scaled residual.
+N_VECTORS = 8
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -43,12 +47,30 @@ class IterativeFactor:
     max_iterations: int = field(metadata={"static": True})
     """Iterations after which a solve gives NaN."""
 
+    @property
+    def is_positive(self) -> Array:
+        """True if the diagonal is positive and a solve succeeds, () bool; costs that solve."""
+        return _is_positive(self)
+
+    @property
+    def compliance(self) -> None:
+        """None: the contact cannot be condensed (nothing is factorised)."""
+        return None
+
+    @property
+    def approximate_compliance(self) -> Array:
+        """Mean of the preconditioner on the unknowns of each pair, (C,): a scale, not a solution.
+
+        It stands for the diagonal of N D^-1 N^T with unit normals.
+        """
+        return jnp.mean(self.preconditioner[self.normals.unknowns], axis=1)
+
     def solve(self, rhs: Array) -> Array:
         """Return D^-1 rhs, (n,)."""
         nothing = jnp.zeros(self.normals.count, bool)
-        return self.solve_on_set(nothing, rhs, jnp.zeros(self.normals.count, rhs.dtype))[0]
+        return self.solve_constrained(nothing, rhs, jnp.zeros(self.normals.count, rhs.dtype))[0]
 
-    def solve_on_set(self, active: Array, rhs: Array, bound: Array) -> tuple[Array, Array]:
+    def solve_constrained(self, active: Array, rhs: Array, bound: Array) -> tuple[Array, Array]:
         """Solve with N w = bound on the active set.
 
         Args:
@@ -97,6 +119,13 @@ class IterativeFactor:
         return z * jnp.where(rho <= goal, 1.0, jnp.nan)
 
 
+@jax.jit
+def _is_positive(factor: IterativeFactor) -> Array:
+    """Solve with ones; compiled as one program, not operation by operation."""
+    weights = factor.preconditioner
+    return jnp.all(weights > 0.0) & jnp.all(jnp.isfinite(factor.solve(jnp.ones_like(weights))))
+
+
 @dataclass(frozen=True)
 class ConjugateGradient:
     """Solve every step by preconditioned conjugate gradients; no factor is stored.
@@ -140,3 +169,8 @@ class ConjugateGradient:
         diagonal = diagonal.at[unknowns].set(jnp.broadcast_to(mean, unknowns.shape))
         tolerance = max(self.tolerance, floor)
         return IterativeFactor(matrix, normals, 1.0 / diagonal, tolerance, self.max_iterations)
+
+    def bytes_needed(self, size: int, dimension: int, itemsize: int) -> float:
+        """Return the memory of the vectors (n,) that an iteration keeps, [bytes]."""
+        del dimension
+        return float(N_VECTORS * itemsize * size)

@@ -10,6 +10,7 @@ import jax.scipy.linalg
 import numpy as np
 from jax import Array
 
+from jaxcontact.linear.interface import Partial
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -27,17 +28,22 @@ class DenseFactor:
     compliance: Array
     """N D^-1 N^T, (C, C)."""
 
+    @property
+    def is_positive(self) -> Array:
+        """True if D is positive definite, () bool: the Cholesky factor of another one is NaN."""
+        return jnp.all(jnp.isfinite(self.inverse))
+
     def solve(self, rhs: Array) -> Array:
         """Return D^-1 rhs, (n,)."""
         return self.inverse @ rhs
 
-    def condense(self, rhs: Array) -> tuple[Array, Array]:
-        """Return D^-1 rhs, (n,), and N D^-1 rhs, (C,)."""
-        return self.inverse @ rhs, self.contact_response @ rhs
+    def condense(self, rhs: Array) -> tuple[Partial, Array]:
+        """Return D^-1 rhs, (n,), as one front, and N D^-1 rhs, (C,)."""
+        return Partial(None, (), self.inverse @ rhs), self.contact_response @ rhs
 
-    def expand(self, partial: Array, multiplier: Array) -> Array:
+    def expand(self, partial: Partial, multiplier: Array) -> Array:
         """Return D^-1 (rhs - N^T multiplier), (n,)."""
-        return partial - multiplier @ self.contact_response
+        return partial.root - multiplier @ self.contact_response
 
 
 @dataclass(frozen=True)
@@ -71,3 +77,8 @@ class Dense:
         response = jnp.sum(normals.weights[:, :, None] * inverse[normals.unknowns], axis=1)
         compliance = jnp.sum(normals.weights[None] * response[:, normals.unknowns], axis=2)
         return DenseFactor(inverse, response, 0.5 * (compliance + compliance.T))
+
+    def bytes_needed(self, size: int, dimension: int, itemsize: int) -> float:
+        """Return the memory of the matrix, its Cholesky factor and its inverse, [bytes]."""
+        del dimension
+        return 3.0 * itemsize * size**2

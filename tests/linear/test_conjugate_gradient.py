@@ -103,7 +103,7 @@ def test_conjugate_gradient_holds_a_fixed_active_set():
     active = np.arange(SYSTEM.normals.count) % 2 == 0
     rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
     bound = jnp.cos(jnp.arange(SYSTEM.normals.count, dtype=float))
-    w, p = factor.solve_on_set(jnp.asarray(active), rhs, bound)
+    w, p = factor.solve_constrained(jnp.asarray(active), rhs, bound)
     assert_close((N @ np.asarray(w))[active], bound[active])
     assert_close(D @ np.asarray(w) + N.T @ np.asarray(p), rhs)
     assert not np.any(np.asarray(p)[~active])

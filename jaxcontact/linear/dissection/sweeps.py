@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.linear.interface import Partial
 from jaxcontact.system.sparse import take
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.symmetric_product import materialize
@@ -42,17 +43,6 @@ class LeafCoupling(NamedTuple):
     """Up to w entries at each of P positions, (w, P)."""
     columns: Array
     """Position of the column of each entry, counted from the first of the other side, (w, P)."""
-
-
-class Partial(NamedTuple):
-    """The result of the sweep up, with the trailing axes of the right-hand side."""
-
-    leaves: Array | None
-    """z = S11^-1 r_1 of all leaves, (P,), if there are any."""
-    values: tuple[tuple[Array, ...], ...]
-    """z of each batch between leaves and root, (F, s), the lowest stage first."""
-    root: Array
-    """z of the root front, (s,)."""
 
 
 def with_trailing_axis(sweep):
