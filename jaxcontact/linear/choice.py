@@ -6,14 +6,11 @@ conjugate gradients are for factors that do not fit in memory.
 
 from __future__ import annotations
 
-import os
-
-import jax
-
 from jaxcontact.linear.conjugate_gradient import ConjugateGradient
 from jaxcontact.linear.dense import Dense
 from jaxcontact.linear.dissection.nested_dissection import NestedDissection
 from jaxcontact.linear.interface import LinearSolver
+from jaxcontact.linear.memory import available_memory
 
 #: Largest number of unknowns that are solved by the dense inverse.
 DENSE_LIMIT = 150
@@ -54,14 +51,3 @@ def check_memory(solver: LinearSolver, size: int, dimension: int, itemsize: int)
             f"{needed / 2**30:.1f} GiB, {available / 2**30:.1f} GiB are free; use "
             "linear_solver=jc.ConjugateGradient(), a coarser mesh or float32"
         )
-
-
-def available_memory() -> int | None:
-    """Return the free memory of the default device, [bytes]; None if it is not known."""
-    stats = jax.devices()[0].memory_stats()
-    if stats and "bytes_limit" in stats:
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None
