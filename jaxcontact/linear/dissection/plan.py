@@ -53,7 +53,7 @@ class DissectionPlan(NamedTuple):
     """Numbers stored by the factor, padding and contact included."""
 
 
-def estimate_memory(plan: DissectionPlan, itemsize: int) -> int:
+def stored_bytes(plan: DissectionPlan, itemsize: int) -> int:
     """Return the bytes of a factor with numbers of `itemsize` bytes, index maps included."""
     maps = [plan.unknown_of_position, plan.position_of_unknown]
     for stage in plan.stages:
