@@ -140,6 +140,23 @@ class ConjugateGradient:
     max_iterations: int = 2000
     """Iterations after which a solve counts as failed; about 20 to 100 are usual."""
 
+    def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ValueError: if the tolerance is not in (0, 1e-2] or no iteration is allowed.
+        """
+        if not 0.0 < self.tolerance <= 1e-2:
+            raise ValueError(
+                f"tolerance must be in (0, 1e-2], got {self.tolerance!r}; gradients need 1e-10 or "
+                "less, 1e-12 is the default"
+            )
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(
+                f"max_iterations must be a positive integer, got {self.max_iterations!r}; 2000 is "
+                "the default"
+            )
+
     def factorize(
         self,
         matrix: SymmetricMatrix,

@@ -168,3 +168,20 @@ def test_conjugate_gradient_works_in_float32():
     assert single.displacement.dtype == jnp.float32
     np.testing.assert_array_equal(single.status, jc.Status.CONVERGED)
     assert_close(single.displacement, double.displacement, SINGLE_AGREEMENT)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"tolerance": 0.0},
+        {"tolerance": -1e-8},
+        {"tolerance": 0.1},
+        {"tolerance": float("nan")},
+        {"max_iterations": 0},
+        {"max_iterations": 10.5},
+    ],
+)
+def test_conjugate_gradient_refuses_options_that_cannot_work(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        jc.ConjugateGradient(**options)

@@ -292,7 +292,7 @@ def test_dissection_plan_of_a_grid_has_fill_of_order_n_log_n():
         entries[m] = plan.n_factor_entries
         # 31/4 n log2 n is the count for the exact nested dissection of a square grid (George 1973).
         assert entries[m] < 7.75 * m**2 * np.log2(m)
-        assert dissection_plan.estimate_memory(plan, 8) > 8 * entries[m]
+        assert dissection_plan.stored_bytes(plan, 8) > 8 * entries[m]
     assert entries[64] < 4 * np.log2(64) / np.log2(32) * 1.1 * entries[32]
 
 
@@ -303,3 +303,9 @@ def test_inverse_of_a_triangular_matrix_times_the_matrix_is_the_identity(s):
     inverse = invert_triangular(jnp.asarray(L))
     np.testing.assert_allclose(inverse @ L, np.broadcast_to(np.eye(s), L.shape), atol=1e-13)
     np.testing.assert_array_equal(np.triu(inverse, 1), 0.0)
+
+
+@pytest.mark.parametrize("leaf_size", [0, -8, 16.0, "32"])
+def test_nested_dissection_refuses_a_leaf_size_that_is_no_positive_integer(leaf_size):
+    with pytest.raises(ValueError, match="leaf_size must be a positive integer"):
+        NestedDissection(leaf_size=leaf_size)

@@ -112,7 +112,18 @@ class NestedDissection:
     """
 
     leaf_size: int = 32
-    """Largest number of unknowns in a part that is not cut further."""
+    """Largest number of unknowns in a part that is not cut further, at least 1."""
+
+    def __post_init__(self) -> None:
+        """Check the option.
+
+        Raises:
+            ValueError: if the leaf size is not a positive integer.
+        """
+        if not isinstance(self.leaf_size, int) or self.leaf_size < 1:
+            raise ValueError(
+                f"leaf_size must be a positive integer, got {self.leaf_size!r}; 32 is the default"
+            )
 
     def factorize(
         self,
