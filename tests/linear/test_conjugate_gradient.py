@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 #: Both solvers are exact up to a relative residual of 1e-12 per step.
 AGREEMENT = 1e-9
@@ -107,6 +108,148 @@ def test_conjugate_gradient_holds_a_fixed_active_set():
     assert_close((N @ np.asarray(w))[active], bound[active])
     assert_close(D @ np.asarray(w) + N.T @ np.asarray(p), rhs)
     assert not np.any(np.asarray(p)[~active])
+
+
+#: Pairs of two unknowns each, and which of them are held.
+N_PAIRS, HELD = 4, np.array([True, False, True, True])
+N_UNKNOWNS = 40
+PAIRS = np.arange(2 * N_PAIRS, dtype=np.int32).reshape(N_PAIRS, 2)
+
+
+def chain(condition):
+    """A free chain of springs on weak springs to the ground: the rigid motion is the lowest mode"""
+    stiffness = 2.0 * np.eye(N_UNKNOWNS) - np.eye(N_UNKNOWNS, k=1) - np.eye(N_UNKNOWNS, k=-1)
+    stiffness[0, 0] = stiffness[-1, -1] = 1.0
+    return stiffness + 4.0 / condition * np.eye(N_UNKNOWNS)
+
+
+def cluster(condition):
+    """A random basis, most eigenvalues one and a few down to the lowest"""
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(N_UNKNOWNS, N_UNKNOWNS)))[0]
+    eigenvalues = np.ones(N_UNKNOWNS)
+    eigenvalues[:8] = np.logspace(0.0, -np.log10(condition), 8)
+    return (basis * eigenvalues) @ basis.T
+
+
+def spread(condition):
+    """A random basis and as many eigenvalues in every decade: the iteration loses its way"""
+    basis = np.linalg.qr(np.random.default_rng(2).normal(size=(N_UNKNOWNS, N_UNKNOWNS)))[0]
+    return (basis * np.logspace(0.0, -np.log10(condition), N_UNKNOWNS)) @ basis.T
+
+
+def random_problem(make, condition, data):
+    """A badly scaled matrix, contact pairs, and the data of a constrained solve"""
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** rng.uniform(-1.0, 1.0, N_UNKNOWNS // 2).repeat(2)
+    matrix = scale[:, None] * make(condition) * scale
+    weights = rng.normal(size=(N_PAIRS, 2))
+    N = np.zeros((N_PAIRS, N_UNKNOWNS))
+    N[np.arange(N_PAIRS)[:, None], PAIRS] = weights
+    w, bound = rng.normal(size=N_UNKNOWNS) / scale, rng.normal(size=N_PAIRS)
+    rhs = {
+        "force": scale * rng.normal(size=N_UNKNOWNS),
+        "velocity": matrix @ w,
+        "bound": np.zeros(N_UNKNOWNS),
+        "rest": N[HELD].T @ rng.normal(size=HELD.sum()),
+    }[data]
+    if data == "rest":
+        bound = np.zeros(N_PAIRS)
+    return matrix, N, ContactNormals(jnp.asarray(weights), PAIRS), scale, rhs, bound
+
+
+@jax.jit
+def factorize_and_solve(values, weights, rhs, bound):
+    normals = ContactNormals(weights, PAIRS)
+    factor = jc.ConjugateGradient().factorize(SymmetricMatrix(values, None), normals)
+    return factor.solve_constrained(jnp.asarray(HELD), rhs, bound)
+
+
+def error_of_a_constrained_solve(make, condition, data):
+    """|w - exact| / (|w| + |rhs|) in the norms of the diagonal; NaN if the solve is"""
+    matrix, N, normals, scale, rhs, bound = random_problem(make, condition, data)
+    w, _ = factorize_and_solve(matrix, normals.weights, rhs, bound)
+    rows = N[HELD] / scale
+    saddle_point = np.block(
+        [[matrix / scale[:, None] / scale, rows.T], [rows, np.zeros((len(rows), len(rows)))]]
+    )
+    exact = np.linalg.solve(saddle_point, np.concatenate([rhs / scale, bound[HELD]]))[:N_UNKNOWNS]
+    size = np.linalg.norm(exact) + np.linalg.norm(rhs / scale)
+    return np.linalg.norm(scale * np.asarray(w) - exact) / size
+
+
+@pytest.mark.parametrize("data", ["force", "velocity", "bound", "rest"])
+@pytest.mark.parametrize("condition", [1e2, 1e4, 1e6, 1e8])
+@pytest.mark.parametrize("make", [chain, cluster, spread])
+def test_conjugate_gradient_solves_badly_conditioned_constrained_problems(make, condition, data):
+    # The accuracy that the solver aims at, and what conditioning leaves of it at 1e8.
+    assert error_of_a_constrained_solve(make, condition, data) < max(AGREEMENT, 1e-16 * condition)
+
+
+@pytest.mark.parametrize("data", ["force", "velocity", "bound"])
+@pytest.mark.parametrize("condition", [1e11, 1e12, 5e12, 6e14])
+@pytest.mark.parametrize("make", [chain, cluster])
+def test_conjugate_gradient_beyond_its_accuracy_gives_nan(make, condition, data):
+    assert np.isnan(error_of_a_constrained_solve(make, condition, data))
+
+
+def test_conjugate_gradient_refuses_a_matrix_beyond_its_accuracy():
+    matrix, _, normals, *_ = random_problem(chain, 5e12, "force")
+    with pytest.raises(ValueError, match=r"condition of about .*e\+12"):
+        jc.ConjugateGradient().factorize(SymmetricMatrix(jnp.asarray(matrix), None), normals)
+
+
+def test_conjugate_gradient_of_nothing_is_zero():
+    matrix, _, normals, *_ = random_problem(chain, 1e4, "force")
+    w, p = factorize_and_solve(matrix, normals.weights, np.zeros(N_UNKNOWNS), np.zeros(N_PAIRS))
+    assert not np.any(w)
+    assert not np.any(p)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_conjugate_gradient_knows_whether_a_matrix_is_positive(sign):
+    matrix, _, normals, _, rhs, bound = random_problem(chain, 1e2, "force")
+    matrix[:2, :2] *= sign
+    factor = jc.ConjugateGradient().factorize(SymmetricMatrix(jnp.asarray(matrix), None), normals)
+    assert bool(factor.is_positive) == (sign > 0.0)
+    w, _ = factorize_and_solve(matrix, normals.weights, rhs, bound)
+    assert np.all(np.isfinite(w)) == (sign > 0.0)
+
+
+def test_conjugate_gradient_refuses_an_indefinite_matrix_with_positive_diagonal():
+    matrix, _, normals, scale, rhs, bound = random_problem(chain, 1e2, "force")
+    # Shifted between its eigenvalues; the diagonal stays positive.
+    matrix -= 0.5 * np.diag(scale**2)
+    assert np.all(np.diag(matrix) > 0.0)
+    w, _ = factorize_and_solve(matrix, normals.weights, rhs, bound)
+    assert np.all(np.isnan(w))
+
+
+def test_conjugate_gradient_keeps_a_heavy_body_at_rest_as_dense():
+    mesh = jc.meshes.rectangle((1.0, 1.0), h=1 / 5)
+    plane = jc.HalfSpace(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
+    material = jc.KelvinVoigt(young=1e4, poisson=0.3, shear_viscosity=5e4)
+    scene = jc.Scene(mesh, material, contact={"bottom": plane}, body_force=np.array([0.0, -9.81]))
+    system = jc.discretize(scene)
+    # Free on the ground and steps much longer than a period: condition about 3e5.
+    steppers = [jc.prepare(system, 0.1, linear_solver=solver) for solver in SOLVERS.values()]
+    settled = jc.simulate(steppers[0], steps=1000)
+    above = settled.displacement[-1].at[:, 1].add(1e-12)  # rounding may lie below the plane
+    initial = jc.State(above, jnp.zeros_like(above))
+
+    @jax.jit
+    def run(stepper, u):
+        def impulse(u):
+            trajectory = jc.simulate(stepper, u, initial=initial)
+            return jnp.sum(trajectory.contact_impulse**2), trajectory
+
+        return jax.value_and_grad(impulse, has_aux=True)(u)
+
+    nothing = jnp.zeros((10, system.n_nodes, 2))
+    ((_, dense), dense_slope), ((_, cg), cg_slope) = (run(s, nothing) for s in steppers)
+    np.testing.assert_array_equal(cg.status, jc.Status.CONVERGED)
+    assert_close(cg.displacement, dense.displacement)
+    assert_close(cg.contact_impulse, dense.contact_impulse)
+    assert_close(cg_slope, dense_slope)
 
 
 def residual_of_a_solve(tolerance):
