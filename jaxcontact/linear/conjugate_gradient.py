@@ -9,8 +9,8 @@ because every contact pair has a node of its own:
 
 The preconditioner M^-1 has one number per node, so that it commutes with P. Velocities have the
 norm |w| = sqrt(w^T M w), residuals |r| = sqrt(r^T M^-1 r). With m, the smallest eigenvalue of
-M^-1 D, which P does not lower, the error of w is at most |r| / m: the iteration goes on until this
-is small, and a solve that cannot get there gives NaN.
+M^-1 D, which P does not lower, the error |w - exact w| is at most |P (r - D w)| / m: the iteration
+goes on until this is small, and a solve that cannot get there gives NaN.
 
 Source: Gould, Hribar, Nocedal, SIAM J. Sci. Comput. 23 (2001).
 """
@@ -141,11 +141,11 @@ class IterativeFactor:
         return w * poison, p * poison
 
     def _wanted_residual(self, terms: Array, size: Array) -> Array:
-        """Return |r| at which the iteration stops, scalar.
+        """Return the size of the residual at which the iteration stops, scalar.
 
         Args:
             terms: |r| + |N_A^T b_A|, scalar.
-            size: the same with |w|, scalar.
+            size: |w| added to it, scalar.
         """
         allowed = self.tolerance**WANTED_ERROR * self.smallest_eigenvalue * size
         attainable = _rounding(size.dtype) * size

@@ -28,7 +28,8 @@ def invert_triangular(L: Array) -> Array:
     diagonal = jnp.diagonal(L, axis1=1, axis2=2)
     identity = jnp.eye(s, dtype=L.dtype)[None]
 
-    def double(k, inverse):
+    def double(k: Array, inverse: Array) -> Array:
+        """Go from the inverses of the blocks of size 2^k to those of size 2^(k + 1)."""
         block = jnp.arange(s) >> k
         is_pair = (block[:, None] == block[None, :] + 1) & (block[None, :] % 2 == 0)
         B = jnp.where(is_pair[None], L, 0)

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.linear.dissection.leaves import CouplingPlan
 from jaxcontact.linear.dissection.numeric import condense_root, factorize_fronts
 from jaxcontact.linear.dissection.plan import plan_for
 from jaxcontact.linear.dissection.sweeps import (
@@ -191,26 +192,27 @@ class NestedDissection:
         return itemsize * 9.0 * size * math.log2(max(size, 2))
 
 
-def _leaf_coupling(values, plan):
+def _leaf_coupling(values: Array, plan: CouplingPlan) -> LeafCoupling:
+    """Take the entries of a coupling from the matrix values, (width, n)."""
     values = jnp.append(values, jnp.zeros((), values.dtype))
     entries = take(values, jnp.asarray(plan.entries))
     return LeafCoupling(entries, jnp.asarray(plan.columns))
 
 
 @with_trailing_axis
-def _solve(factor, rhs):
+def _solve(factor: DissectionFactor, rhs: Array) -> Array:
     partial = sweep_up(factor, rhs)
     return sweep_down(factor, partial, partial.root)
 
 
 @with_trailing_axis
-def _condense(factor, rhs):
+def _condense(factor: DissectionFactor, rhs: Array) -> tuple[Partial, Array]:
     partial = sweep_up(factor, rhs)
     at_contact = take(partial.root, factor.contact_places)
     return partial, jnp.einsum("ck,ck...->c...", factor.contact_weights, at_contact)
 
 
 @with_trailing_axis
-def _expand(factor, partial, multiplier):
+def _expand(factor: DissectionFactor, partial: Partial, multiplier: Array) -> Array:
     correction = jnp.einsum("cj,c...->j...", factor.contact_response, multiplier)
     return sweep_down(factor, partial, partial.root - correction)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.linear.dissection.layout import BatchPlan
+from jaxcontact.linear.dissection.batches import BatchPlan
 from jaxcontact.linear.triangular import invert_triangular
 from jaxcontact.system.sparse import take
 
@@ -25,7 +25,7 @@ from jaxcontact.system.sparse import take
 @partial(jax.jit, static_argnames="with_leaves")
 def factorize_fronts(
     values: Array, stages: tuple[tuple[BatchPlan, ...], ...], *, with_leaves: bool
-):
+) -> tuple[tuple[tuple[Array, ...], ...], tuple[tuple[Array, ...], ...], Array]:
     """Factorise all fronts.
 
     Args:
@@ -60,7 +60,7 @@ def factorize_fronts(
 
 
 @jax.jit
-def condense_root(inverse: Array, weights: Array, places: Array):
+def condense_root(inverse: Array, weights: Array, places: Array) -> tuple[Array, Array]:
     """Apply the contact rows to the root: N_0 S_0^-1, (C, s), and N_0 S_0^-1 N_0^T, (C, C).
 
     Args:
@@ -74,8 +74,14 @@ def condense_root(inverse: Array, weights: Array, places: Array):
     return response, 0.5 * (compliance + compliance.T)
 
 
-def _assemble(batch, values, schur):
-    """Front matrices: own columns S11 over S21, (F, s + b, s), and S22, (F, b, b)."""
+def _assemble(batch: BatchPlan, values: Array, schur: Array) -> tuple[Array, Array]:
+    """Front matrices: own columns S11 over S21, (F, s + b, s), and S22, (F, b, b).
+
+    Args:
+        batch: index maps.
+        values: entries of the matrix, (width, n).
+        schur: Schur complements of the earlier stage one after the other, with a zero behind them.
+    """
     n_fronts, s = batch.own.shape
     b = batch.boundary.shape[1]
     own = jnp.zeros(n_fronts * (s + b) * s, values.dtype)
@@ -88,7 +94,10 @@ def _assemble(batch, values, schur):
         stride = batch.child_stride[child][:, None, None]
         position = batch.child_position[child]
 
-        def gather(rows, columns, base=base, stride=stride):
+        def gather(
+            rows: Array, columns: Array, base: Array = base, stride: Array = stride
+        ) -> Array:
+            """Entries (rows, columns) of the child's Schur complement, zero where it has none."""
             rows, columns = rows[:, :, None], columns[:, None, :]
             place = base + rows * stride + columns
             is_missing = (rows < 0) | (columns < 0)
@@ -99,7 +108,7 @@ def _assemble(batch, values, schur):
     return own, rest
 
 
-def _eliminate(own_columns, rest):
+def _eliminate(own_columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
     """S11^-1, V, the Schur complement and the pivots (diagonal of L) of a batch."""
     s = own_columns.shape[2]
     L = jax.lax.linalg.cholesky(own_columns[:, :s], symmetrize_input=False)

@@ -30,7 +30,13 @@ class Dissection(NamedTuple):
     """Number of depths, the leaves included."""
 
 
-def dissect(edges, coordinates, sizes, is_last, leaf_size) -> Dissection:
+def dissect(
+    edges: np.ndarray,
+    coordinates: np.ndarray,
+    sizes: np.ndarray,
+    is_last: np.ndarray,
+    leaf_size: int,
+) -> Dissection:
     """Order the nodes of a graph by nested dissection.
 
     After the call two nodes that share an edge lie on one line of descent of the separator tree.
@@ -60,8 +66,8 @@ def dissect(edges, coordinates, sizes, is_last, leaf_size) -> Dissection:
         level += 1
 
 
-def hop_coordinates(edges, n_nodes) -> np.ndarray:
-    """Positions (N, 3) from distances counted in edges, for a mesh whose points are not known.
+def hop_coordinates(edges: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Return positions (N, 3) from distances counted in edges, for a mesh without known points.
 
     Each column is the difference of the distances to two nodes far apart. Connected components are
     chained by one extra edge each, so that every distance is finite.
@@ -73,7 +79,8 @@ def hop_coordinates(edges, n_nodes) -> np.ndarray:
         chain = np.stack([first[:-1], first[1:]], 1)
         graph = _adjacency(np.concatenate([edges, chain]), n_nodes)
 
-    def hops(node):
+    def hops(node: int) -> np.ndarray:
+        """Return the distance of every node, (N,)."""
         return dijkstra(graph, directed=False, unweighted=True, indices=node)
 
     columns, nearest = [], hops(int(hops(0).argmax()))
@@ -85,13 +92,27 @@ def hop_coordinates(edges, n_nodes) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _adjacency(edges, n_nodes):
+def _adjacency(edges: np.ndarray, n_nodes: int) -> csr_array:
+    """Return the graph of the edges (E, 2), (N, N)."""
     ones = np.ones(len(edges), np.int8)
     return coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(n_nodes, n_nodes)).tocsr()
 
 
-def _bisect(edges, coordinates, sizes, part, active):
+def _bisect(
+    edges: np.ndarray,
+    coordinates: np.ndarray,
+    sizes: np.ndarray,
+    part: np.ndarray,
+    active: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Cut every part across the axis with the smallest separator.
+
+    Args:
+        edges: node pairs within one part, (E, 2).
+        coordinates: positions of the nodes, (N, d).
+        sizes: unknowns of each node, (N,).
+        part: part of each node, (N,).
+        active: nodes that are not eliminated yet, (A,).
 
     Returns:
         side of each node, 0 or 1, (N,); True for the nodes of the separators, (N,).
@@ -103,6 +124,7 @@ def _bisect(edges, coordinates, sizes, part, active):
         side_k = _halve(np.roll(coordinates, -axis, 1), sizes, part, active)
         cover = _minimum_cover(edges[side_k[edges[:, 0]] != side_k[edges[:, 1]]], side_k)
         width = np.bincount(part[cover], sizes[cover], len(smallest))
+        # What an earlier axis has chosen is undone in the parts that this axis cuts better.
         is_better = width < smallest
         smallest = np.where(is_better, width, smallest)
         chosen = active[is_better[part[active]]]
@@ -112,7 +134,9 @@ def _bisect(edges, coordinates, sizes, part, active):
     return side, is_separator
 
 
-def _halve(coordinates, sizes, part, active):
+def _halve(
+    coordinates: np.ndarray, sizes: np.ndarray, part: np.ndarray, active: np.ndarray
+) -> np.ndarray:
     """Side (N,) of each node when its part is cut at the median of the first coordinate."""
     keys = coordinates[active].T[::-1]  # ties of the first coordinate are broken by the others
     order = active[np.lexsort((*keys, part[active]))]
@@ -124,7 +148,7 @@ def _halve(coordinates, sizes, part, active):
     return side
 
 
-def _minimum_cover(cut, side):
+def _minimum_cover(cut: np.ndarray, side: np.ndarray) -> np.ndarray:
     """Smallest set of nodes that meets every cut edge (K, 2), all parts at once."""
     if len(cut) == 0:
         return np.zeros(0, np.int64)

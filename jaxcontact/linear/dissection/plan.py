@@ -13,17 +13,13 @@ from collections import OrderedDict
 from typing import NamedTuple
 
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.linear.dissection.layout import (
-    BatchPlan,
-    Unknowns,
-    lay_out,
-    make_stage,
-    positions,
-)
+from jaxcontact.linear.dissection.batches import BatchPlan, lay_out
+from jaxcontact.linear.dissection.layout import Stage, Unknowns, make_stage, positions
 from jaxcontact.linear.dissection.leaves import CouplingPlan, couple_leaves
-from jaxcontact.linear.dissection.order import dissect, hop_coordinates
+from jaxcontact.linear.dissection.order import Dissection, dissect, hop_coordinates
 from jaxcontact.linear.dissection.stages import (
     Tree,
     cost_of_batch,
@@ -66,7 +62,12 @@ _PLANS: OrderedDict[bytes, DissectionPlan] = OrderedDict()
 _MAX_PLANS = 8
 
 
-def plan_for(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
+def plan_for(
+    columns: Array | np.ndarray,
+    unknowns: Array | np.ndarray,
+    coordinates: Array | np.ndarray | None,
+    leaf_size: int,
+) -> DissectionPlan:
     """Return the plan of a sparsity pattern, from the last few plans if it is among them.
 
     Args:
@@ -99,7 +100,12 @@ def plan_for(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     return _PLANS[digest]
 
 
-def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
+def build_plan(
+    columns: np.ndarray,
+    unknowns: np.ndarray,
+    coordinates: np.ndarray | None,
+    leaf_size: int,
+) -> DissectionPlan:
     """Order the unknowns and lay out the factorisation.
 
     Args:
@@ -111,6 +117,7 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     n = columns.shape[1]
     is_contact = np.zeros(n, bool)
     is_contact[unknowns] = True
+    # The components of a mesh node have identical rows: their graph is d^2 times smaller.
     node, first = _group(columns, is_contact)
     sizes = np.bincount(node)
     tails = np.broadcast_to(np.arange(len(first)), (len(columns), len(first))).ravel()
@@ -124,7 +131,7 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     tree = _eliminate(dissect(half, points, sizes, is_contact[first], leaf_size), edges, sizes)
     heads, with_leaves = merge_depths(tree)
     where = _locate(tree, heads, node)
-    stages = []
+    stages: list[Stage] = []
     for head, end in zip(heads, [*heads[1:], len(tree.own_size)], strict=True):
         own, boundary = own_size(tree, head, end), tree.boundary_size[head]
         parts, nodes = tree.boundary[head]
@@ -154,9 +161,11 @@ def build_plan(columns, unknowns, coordinates, leaf_size) -> DissectionPlan:
     )
 
 
-def _group(columns, is_contact):
+def _group(columns: np.ndarray, is_contact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Group unknowns with identical rows into nodes: node (n,) and a first unknown of each (N,)."""
     n = columns.shape[1]
+    # Rows are compared by the sum of random keys of their columns, the own one included once: the
+    # padding of a row repeats it. Contact unknowns never share a node with others.
     key = np.random.default_rng(0).integers(0, 2**63, n, dtype=np.uint64)
     is_own = columns == np.arange(n)
     signature = np.where(is_own, 0, key[columns]).sum(0, dtype=np.uint64) + key * is_own.any(0)
@@ -168,39 +177,57 @@ def _group(columns, is_contact):
     return rank[node], first[order]
 
 
-def _eliminate(dissection, edges, sizes) -> Tree:
-    """Find the boundary of each part: the later nodes that its elimination couples."""
+def _eliminate(dissection: Dissection, edges: np.ndarray, sizes: np.ndarray) -> Tree:
+    """Find the boundary of each part: the later nodes that its elimination couples.
+
+    From the leaves to the root, the boundary of a part are the later neighbours of its own nodes
+    and what its children pass on: their boundary without the nodes of the part itself.
+
+    Args:
+        dissection: the separator tree of N nodes.
+        edges: (E, 2) node pairs, each edge in both directions.
+        sizes: unknowns of each node, (N,).
+    """
     depth, part, n_depths = dissection
     n = len(depth)
     rank = np.empty(n, np.int64)  # nodes near the leaves first, so children and parents agree
     rank[np.lexsort((part, -depth))] = np.arange(n)
     node_of_rank = np.argsort(rank)
     below, above = edges[depth[edges[:, 0]] > depth[edges[:, 1]]].T
-    boundary, own_size, boundary_size = [], [], []
+    boundary, n_own, n_boundary = [], [], []
     inherited = np.zeros(0, np.int64)
     for level in range(n_depths - 1, -1, -1):
         is_here = depth[below] == level
         direct = part[below[is_here]] * n + rank[above[is_here]]
-        pairs = np.unique(np.concatenate([direct, inherited]))
-        parts, nodes = pairs // n, node_of_rank[pairs % n]
+        # Keys part * n + rank: sorted by part, then in the order of elimination, each once.
+        keys = np.unique(np.concatenate([direct, inherited]))
+        parts, nodes = keys // n, node_of_rank[keys % n]
         n_parts = 2 ** max(level - 1, 0)
         here = np.flatnonzero(depth == level)
         boundary.append((parts, nodes))
-        own_size.append(np.bincount(part[here], sizes[here], n_parts).astype(np.int64))
-        boundary_size.append(np.bincount(parts, sizes[nodes], n_parts).astype(np.int64))
+        n_own.append(np.bincount(part[here], sizes[here], n_parts).astype(np.int64))
+        n_boundary.append(np.bincount(parts, sizes[nodes], n_parts).astype(np.int64))
         is_later = depth[nodes] < level - 1
         inherited = (parts[is_later] // 2) * n + rank[nodes[is_later]]
-    return Tree(depth, part, rank, boundary[::-1], own_size[::-1], boundary_size[::-1])
+    return Tree(depth, part, rank, boundary[::-1], n_own[::-1], n_boundary[::-1])
 
 
-def _count_entries(tree):
+def _count_entries(tree: Tree) -> int:
+    """Count the entries of the factor's lower triangle without padding."""
     sizes = zip(tree.own_size, tree.boundary_size, strict=True)
     return int(sum((s * (s + 1) // 2 + s * b).sum() for s, b in sizes))
 
 
-def _locate(tree, heads, node) -> Unknowns:
-    """Stage, front and position of every unknown."""
+def _locate(tree: Tree, heads: list[int], node: np.ndarray) -> Unknowns:
+    """Find stage, front and position of every unknown, (n,) each.
+
+    Args:
+        tree: the separator tree.
+        heads: first depth of each stage, from the root.
+        node: node of each unknown, (n,).
+    """
     n = len(node)
+    # The front of a part is its ancestor at the head of the stage: one halving per depth.
     stage_of_depth = np.searchsorted(heads, np.arange(len(tree.own_size)), side="right") - 1
     stage = stage_of_depth[tree.depth[node]]
     front = tree.part[node] >> (tree.depth[node] - np.asarray(heads)[stage])
@@ -213,7 +240,9 @@ def _locate(tree, heads, node) -> Unknowns:
     return Unknowns(stage, front, local, rank)
 
 
-def _unknowns_of(parts, nodes, node, sizes, rank):
+def _unknowns_of(
+    parts: np.ndarray, nodes: np.ndarray, node: np.ndarray, sizes: np.ndarray, rank: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Spread pairs (part, node) to pairs (part, unknown): key part * n + rank, and the unknown."""
     n = len(node)
     members = np.argsort(node, kind="stable")

@@ -10,6 +10,7 @@ differ. Stages and batches minimise
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -40,14 +41,20 @@ class Tree(NamedTuple):
     """Separator tree of the nodes: where each is eliminated, and the boundary of every part."""
 
     depth: np.ndarray
+    """Depth at which each node is eliminated, (N,)."""
     part: np.ndarray
-    rank: np.ndarray  # place in the order of elimination
-    boundary: list[tuple[np.ndarray, np.ndarray]]  # per depth: part and node, sorted by part, rank
-    own_size: list[np.ndarray]  # per depth and part: unknowns
+    """Its part of that depth, (N,)."""
+    rank: np.ndarray
+    """Its place in the order of elimination, (N,)."""
+    boundary: list[tuple[np.ndarray, np.ndarray]]
+    """Pairs (part, node) of each depth, sorted by part and rank."""
+    own_size: list[np.ndarray]
+    """Unknowns of each part of each depth."""
     boundary_size: list[np.ndarray]
+    """Boundary unknowns of each part of each depth."""
 
 
-def merge_depths(tree) -> tuple[list[int], bool]:
+def merge_depths(tree: Tree) -> tuple[list[int], bool]:
     """Choose the stages: the first depth of each, from the root; and whether the last are leaves.
 
     The fronts at the bottom of a small tree are not worth the sparse coupling of leaves.
@@ -59,8 +66,12 @@ def merge_depths(tree) -> tuple[list[int], bool]:
     return heads, False
 
 
-def _cheapest_stages(tree, with_leaves) -> tuple[float, list[int]]:
-    """Merge depths by dynamic programming: the cost, and the first depth of each stage."""
+def _cheapest_stages(tree: Tree, with_leaves: bool) -> tuple[float, list[int]]:
+    """Merge depths by dynamic programming: the cost, and the first depth of each stage.
+
+    best[head] is the least cost of the depths from `head` on, choice[head] the end of their first
+    stage.
+    """
     n_depths = len(tree.own_size)
     batch_cost = cost_of_batch(tree)
     best, choice = [0.0] * (n_depths + 1), [0] * (n_depths + 1)
@@ -72,6 +83,7 @@ def _cheapest_stages(tree, with_leaves) -> tuple[float, list[int]]:
             boundary = tree.boundary_size[head]
             cost = split_into_batches(own, boundary, is_leaf, batch_cost)[1]
             costs.append(cost + best[end])
+            # Longer stages stream more than this whatever their boundary.
             if (own**2).sum() > 4 * min(costs):
                 break
         best[head] = min(costs)
@@ -82,19 +94,27 @@ def _cheapest_stages(tree, with_leaves) -> tuple[float, list[int]]:
     return best[0], heads
 
 
-def cost_of_batch(tree):
-    """Cost of one more batch, in numbers streamed."""
+def cost_of_batch(tree: Tree) -> float:
+    """Return the cost of one more batch, in numbers streamed."""
     sizes = zip(tree.own_size, tree.boundary_size, strict=True)
     return LAUNCH_COST + COMPILE_COST * sum(int((s * (s + 2 * b)).sum()) for s, b in sizes)
 
 
-def split_into_batches(own, boundary, is_leaf, batch_cost):
+def split_into_batches(
+    own: np.ndarray, boundary: np.ndarray, is_leaf: bool, batch_cost: float
+) -> tuple[np.ndarray, float]:
     """Split fronts into batches of similar size: batch of each front (F,), and the cost.
 
     Fronts are sorted by their work, by their own or by their boundary unknowns, whichever is best.
+
+    Args:
+        own: own unknowns of each front, (F,).
+        boundary: boundary unknowns of each front, (F,).
+        is_leaf: whether the fronts are leaves.
+        batch_cost: cost of one more batch, see `cost_of_batch`.
     """
 
-    def work(s, b):
+    def work(s: np.ndarray, b: np.ndarray) -> np.ndarray:
         return LEAF_COST * s * (s + LEAF_BOUNDARY * b) if is_leaf else s * (s + 2.0 * b)
 
     if is_leaf:
@@ -108,8 +128,19 @@ def split_into_batches(own, boundary, is_leaf, batch_cost):
     return min(splits, key=lambda split: split[1])
 
 
-def _split(order, own, boundary, work, batch_cost, n_cuts=24):
-    """Cut a sequence of fronts into batches by dynamic programming."""
+def _split(
+    order: np.ndarray,
+    own: np.ndarray,
+    boundary: np.ndarray,
+    work: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    batch_cost: float,
+    n_cuts: int = 24,
+) -> tuple[np.ndarray, float]:
+    """Cut a sequence of fronts into batches by dynamic programming, at one of some places.
+
+    best[j] is the least cost of the fronts before cut j, start[j] the cut where their last batch
+    begins; a batch costs the work of its largest sizes for each of its fronts.
+    """
     cuts = np.unique(np.linspace(0, len(own), min(len(own), n_cuts) + 1).astype(int))
     s = round_up(np.maximum.reduceat(own[order], cuts[:-1]))
     b = np.maximum.reduceat(boundary[order], cuts[:-1])
@@ -128,7 +159,11 @@ def _split(order, own, boundary, work, batch_cost, n_cuts=24):
     return np.unique(label, return_inverse=True)[1], best[-1]
 
 
-def own_size(tree, head, end):
-    """Unknowns that each part of depth `head` eliminates when the depths up to `end` are merged."""
+def own_size(tree: Tree, head: int, end: int) -> np.ndarray:
+    """Return the unknowns that each part of depth `head` eliminates with the depths below `end`.
+
+    The parts that a part is cut into are consecutive at every depth.
+    """
     n_parts = len(tree.own_size[head])
-    return sum(tree.own_size[depth].reshape(n_parts, -1).sum(1) for depth in range(head, end))
+    sizes = [tree.own_size[depth].reshape(n_parts, -1).sum(1) for depth in range(head, end)]
+    return np.sum(sizes, axis=0)

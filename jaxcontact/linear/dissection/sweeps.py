@@ -7,7 +7,8 @@ index maps come from the symbolic phase; a sweep gathers and never scatters.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,11 @@ from jaxcontact.linear.interface import Partial
 from jaxcontact.system.sparse import take
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.symmetric_product import materialize
+
+if TYPE_CHECKING:
+    from jaxcontact.linear.dissection.nested_dissection import DissectionFactor
+
+R = TypeVar("R")
 
 MAX_SUMMED_ROWS = 64
 """Rows of a leaf that are summed one by one. XLA's CPU runtime shares such a sum between its
@@ -45,7 +51,7 @@ class LeafCoupling(NamedTuple):
     """Position of the column of each entry, counted from the first of the other side, (w, P)."""
 
 
-def with_trailing_axis(sweep):
+def with_trailing_axis(sweep: Callable[..., R]) -> Callable[..., R]:
     """Let vmap over the operands (not over the factor) append to the trailing axis.
 
     The sweep is under jit, so that it is not traced anew at every call.
@@ -54,19 +60,25 @@ def with_trailing_axis(sweep):
     batched = jax.custom_batching.custom_vmap(sweep)
 
     @batched.def_vmap
-    def _(size, is_batched, factor, *operands):
+    def _(
+        size: int, is_batched: list, factor: DissectionFactor, *operands: Array | Partial
+    ) -> tuple[R, R]:
         is_factor_batched = jax.tree.map(lambda flag: 0 if flag else None, is_batched[0])
         if any(jax.tree.leaves(is_batched[0])):
+            # Several matrices: nothing is shared, the plain rule is right.
             axes = jax.tree.map(lambda flag: 0 if flag else None, is_batched[1:])
             result = jax.vmap(sweep, in_axes=(is_factor_batched, *axes))(factor, *operands)
             return result, jax.tree.map(lambda _: True, result)
-        is_matrix = operands[-1].ndim - is_batched[-1] == 2
+        # The last operand is one array; with a trailing axis already, both become one.
+        is_matrix = jax.tree.leaves(operands)[-1].ndim - jax.tree.leaves(is_batched)[-1] == 2
 
-        def append(x, flag):
+        def append(x: Array, flag: bool) -> Array:
+            """Move the batch axis to the end: (n,) -> (n, size), (n, r) -> (n, r size)."""
             x = jnp.moveaxis(x, 0, -1) if flag else jnp.broadcast_to(x[..., None], (*x.shape, size))
             return x.reshape(*x.shape[:-2], -1) if is_matrix else x
 
-        def split(x):
+        def split(x: Array) -> Array:
+            """Undo `append`: the batch axis comes first."""
             x = x.reshape(*x.shape[:-1], -1, size) if is_matrix else x
             return jnp.moveaxis(x, -1, 0)
 
@@ -76,7 +88,7 @@ def with_trailing_axis(sweep):
     return jax.jit(batched)
 
 
-def _sum_sources(update, sources):
+def _sum_sources(update: Array, sources: Array) -> Array:
     """Add up the contributions of the children, (K, ...) places -> (...)."""
     total = take(update, sources[0])
     for k in range(1, sources.shape[0]):
@@ -84,7 +96,7 @@ def _sum_sources(update, sources):
     return total
 
 
-def _multiply_leaves(factor, x):
+def _multiply_leaves(factor: DissectionFactor, x: Array) -> Array:
     """Multiply values of all leaf positions, (P,), by S11^-1."""
     tail, place, products = x.shape[1:], 0, []
     for inverse in factor.leaves:
@@ -102,7 +114,7 @@ def _multiply_leaves(factor, x):
     return jnp.concatenate(products)
 
 
-def _couple(coupling, x):
+def _couple(coupling: LeafCoupling, x: Array) -> Array:
     """Multiply values of the positions on one side by D21 or its transpose: those of the other."""
     entries = coupling.entries.reshape(*coupling.entries.shape, *(1 for _ in x.shape[1:]))
     product = entries[0] * take(x, coupling.columns[0])
@@ -111,8 +123,12 @@ def _couple(coupling, x):
     return product
 
 
-def sweep_up(factor, rhs) -> Partial:
-    """Sweep from the leaves to the root."""
+def sweep_up(factor: DissectionFactor, rhs: Array) -> Partial:
+    """Sweep from the leaves to the root.
+
+    `place` is the first position of what is done: positions run from the root to the leaves. The
+    right-hand side of a front is its own part and what its children have passed on.
+    """
     tail = rhs.shape[1:]
     rhs = take(materialize(rhs, factor.origin), factor.unknown_of_position)
     leaves = None
@@ -145,8 +161,11 @@ def sweep_up(factor, rhs) -> Partial:
     return Partial(leaves, tuple(values), root)
 
 
-def sweep_down(factor, partial, root) -> Array:
-    """Sweep from the root, with its solution (s,), to the leaves."""
+def sweep_down(factor: DissectionFactor, partial: Partial, root: Array) -> Array:
+    """Sweep from the root, with its solution (s,), to the leaves.
+
+    The solution is complete at all positions before `place`, where every boundary lies.
+    """
     tail = root.shape[1:]
     n_other = factor.unknown_of_position.shape[0] - root.shape[0]
     solution = jnp.concatenate([root, jnp.zeros((n_other, *tail), root.dtype)])
@@ -162,7 +181,7 @@ def sweep_down(factor, partial, root) -> Array:
             solution, jnp.concatenate(found), place, axis=0
         )
         place += sum(y.shape[0] for y in found)
-    if factor.leaves:
+    if partial.leaves is not None:
         coupled = materialize(_couple(factor.couplings[1], solution), factor.origin)
         y = partial.leaves - _multiply_leaves(factor, coupled)
         solution = jax.lax.dynamic_update_slice_in_dim(solution, y, place, axis=0)
