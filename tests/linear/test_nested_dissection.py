@@ -132,6 +132,16 @@ def test_nested_dissection_leaf_size_does_not_change_the_solution(monkeypatch, w
         assert error_of_step(factor, matrix, normals) < ROUNDING
 
 
+def test_nested_dissection_solves_with_a_batch_of_empty_fronts(monkeypatch, with_leaves):
+    # Small parts have nothing left to eliminate; cheap launches put them in a batch of their own.
+    monkeypatch.setattr(dissection_stages, "LAUNCH_COST", 500)
+    matrix, normals, coordinates = problem((6, 7, 5), 3)
+    factor = NestedDissection(leaf_size=16).factorize(padded_rows(matrix), normals, coordinates)
+    inverses = [batch.inverse for stage in factor.stages for batch in stage]
+    assert with_leaves or any(inverse.size == 0 for inverse in inverses)
+    assert error_of_step(factor, matrix, normals) < ROUNDING
+
+
 def test_nested_dissection_of_less_than_a_leaf_is_one_front():
     matrix, normals, coordinates = problem((3, 3), 2)
     factor = NestedDissection().factorize(padded_rows(matrix), normals, coordinates)

@@ -234,7 +234,7 @@ def _batch_plan(
         own=own_table,
         is_padding=is_padding,
         boundary=boundary_table,
-        sources=sources.reshape(-1, n_fronts, s + b),
+        sources=sources.reshape(len(sources), n_fronts, s + b),
         entries=int32(entry_table),
         child_base=int32(children.schur[siblings]),
         child_stride=int32(children.b[siblings]),

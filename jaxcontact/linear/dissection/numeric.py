@@ -46,7 +46,7 @@ def factorize_fronts(
             inverse, coupling, complement, pivots = _eliminate(own_columns, rest)
             # NaN spreads to all other fronts. The dependence also keeps the batches in sequence:
             # XLA's CPU runtime may deadlock when several batched LAPACK calls run at once.
-            values = values + 0 * jnp.min(pivots)
+            values = values + 0 * jnp.min(pivots, initial=1.0)
             is_positive &= jnp.all(pivots > 0)
             stage_inverses.append(inverse)
             stage_couplings.append(coupling)
