@@ -8,7 +8,7 @@ from support.bodies import DT, ELASTIC, VISCOUS, block, random_control, random_i
 
 import jaxcontact as jc
 
-# What the issue asks of the ledger, relative to the largest energy of the run.
+# How exactly the ledger must balance, relative to the largest energy of the run.
 LEDGER_TOLERANCE = 1e-10
 # Energies are sums of positive terms that rounding can move by a few units of the last place.
 ROUNDING = 1e-13

@@ -13,7 +13,7 @@ from support.independent import simulate as simulate_independently
 import jaxcontact as jc
 from jaxcontact.contact import Status
 
-# What the issue asks of every step, relative to the largest term of each condition.
+# What a step must reach, relative to the largest term of each condition.
 KKT_TOLERANCE = 1e-10
 # Two exact methods for the same motion; impacts amplify rounding errors a little.
 AGREEMENT = 1e-9
@@ -376,7 +376,7 @@ def bar_impact():
 
 def test_bar_impact_has_the_exact_impulse(bar_impact):
     bar, _, motion = bar_impact
-    # The one per cent of the issue.
+    # A step is 1/400 of the contact: four of them.
     np.testing.assert_allclose(np.sum(motion.contact_impulse), bar.impulse(), rtol=0.01)
 
 
