@@ -1,7 +1,8 @@
 """Dynamic contact of viscoelastic bodies in JAX, with exact gradients through the impact.
 
 Shape comments use one letter per axis: N nodes, E or e cells, a b local nodes of a cell, d the
-space dimension, i j components, n unknowns, C contact pairs, T time steps.
+space dimension, i j components, n unknowns, C contact pairs, T time steps. In a `Source:` the paper
+is Müller and Schiela (2017) and MATH.md lies in the folder notebooks/ of the repository.
 """
 
 import importlib

@@ -6,7 +6,7 @@
 with strong contact S and weak contact W. Block principal pivoting: solve with equality on a set A,
 S <= A <= S + W, and move every weak pair with a wrong sign to the other side; when that stops
 helping, move one pair at a time, which cannot cycle on an SPD problem. Without weak contact, one
-solve. Source: Theorem 4.20; Judice, Pires, Computers Ops Res. 21 (1994) 587-596.
+solve. Source: paper, Theorem 4.20; Judice, Pires, Computers Ops Res. 21 (1994) 587-596.
 """
 
 from __future__ import annotations

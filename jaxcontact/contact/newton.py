@@ -1,9 +1,9 @@
 """Semismooth Newton for the contact problem of one step: the primal-dual active set method.
 
 On the active set A:  (W p + q)_A = 0,  p = 0 elsewhere;   A <- {i: W_ii p_i - (W p + q)_i > 0},
-until A repeats. Source: Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2003). Finite on every
-problem seen in time stepping, but it may cycle for a general SPD compliance; projected
-Gauss-Seidel then takes over.
+until A repeats. Finite on every problem seen in time stepping, but it may cycle for a general SPD
+compliance; projected Gauss-Seidel then takes over. Source: Hintermueller, Ito, Kunisch, SIAM J.
+Optim. 13 (2003).
 """
 
 from __future__ import annotations

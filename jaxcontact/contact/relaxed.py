@@ -15,7 +15,7 @@ is never infeasible, has the matrix W + diag(g / p), and becomes the primal-dual
 as kappa tends to zero. The derivative dp = -(W + diag(g / p))^-1 dq replaces the active set of
 exact contact by the weight g / p: zero on strong contact, infinite off contact, and in weak
 contact the share of the multiplier. Source: MATH.md 5; Forsgren, Gill, Wright, SIAM Review 44
-(2002) for the barrier; Chen, Harker, Kanzow, Smale for the change of unknowns.
+(2002) for the barrier; Chen, Harker, SIAM J. Matrix Anal. Appl. 14 (1993) for the unknown x.
 """
 
 from __future__ import annotations

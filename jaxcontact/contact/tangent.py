@@ -5,7 +5,7 @@ With the active set A of the solution held fixed, (w, p) is linear in the data,
     D dw + N^T dp = dr - dD w - dN^T p,    (N dw - s dp)_i = (db - dN w)_i on A,    dp_i = 0 else.
 
 `weak.py` names the choices of A at weak contact, `critical_cone.py` solves for the one-sided
-derivative. Source: Theorem 4.20.
+derivative. Source: paper, Theorem 4.20.
 """
 
 from __future__ import annotations

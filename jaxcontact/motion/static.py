@@ -3,7 +3,7 @@
     A y + N^T c = f,    N y <= psi,    c >= 0,    c . (psi - N y) = 0,
 
 the minimum of y.Ay/2 - f.y over the admissible displacements: the contact problem of a time step
-with the stiffness matrix. Source: Signorini's problem; MATH.md 1 without inertia.
+with the stiffness matrix. Source: MATH.md 1 without inertia, Signorini's problem.
 """
 
 from __future__ import annotations

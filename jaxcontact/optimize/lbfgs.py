@@ -5,7 +5,7 @@ derivative are covectors, and the inner product enters only as the first matrix
 H_0 = gamma M^-1, gamma = s.y / (y . M^-1 y). This is BFGS in the Hilbert space, at the price of
 one Riesz representative per iteration and no product with the mass in the recursion. With the weak
 Wolfe line search it also converges on nonsmooth functions, in practice to their minimisers.
-Source: Nocedal and Wright, Numerical Optimization, Algorithm 7.4; Lewis and Overton (2013).
+Source: Nocedal, Wright, Numerical Optimization (2006), Algorithm 7.4; Lewis, Overton (2013).
 """
 
 from __future__ import annotations

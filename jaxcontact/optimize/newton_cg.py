@@ -6,7 +6,7 @@ The Hessian product is the derivative of the adjoint gradient with all active se
 element of the generalised Hessian, exact where J is twice differentiable. The minimiser of the
 model is sought by CG in the inner product of the parameters, so the number of products does not
 grow with the mesh. With bounds, the model is minimised on the free variables and the step is
-projected. Source: Conn, Gould, Toint, Trust-Region Methods, Algorithms 6.1.1 and 7.5.1.
+projected. Source: Conn, Gould, Toint, Trust-Region Methods (2000), Algorithms 6.1.1, 7.5.1.
 """
 
 from __future__ import annotations

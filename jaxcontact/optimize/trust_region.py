@@ -6,8 +6,8 @@ CG in the inner product M, i.e. preconditioned by M^-1, starting at zero. Its it
 M-norm and lower the model, so the path that they form is cut where it leaves the trust region, or
 followed to the boundary along a direction of negative curvature. The path for a smaller radius is
 the beginning of the same path: `cut` costs no product with the Hessian.
-Source: Nocedal and Wright, Numerical Optimization, Algorithm 7.2; Conn, Gould, Toint,
-Trust-Region Methods, 7.5.1.
+Source: Nocedal, Wright, Numerical Optimization (2006), Algorithm 7.2; Conn, Gould, Toint,
+Trust-Region Methods (2000), 7.5.1.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ impacts k = 0, 1, 2, ... happen at
 
 for e < 1 they accumulate at t_0 + (2 w/g) e/(1 - e), after which the mass rests.
 
-Source: elementary; B. Brogliato, Nonsmooth Mechanics, Springer 1999.
+Source: B. Brogliato, Nonsmooth Mechanics, Springer (1999).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ With v0 = sqrt(2 g h0):
 If 2 v0/g is a multiple of 2L/c, the next impact is the time reverse of the first one and the
 motion is periodic.
 
-Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) for the bar; d'Alembert.
+Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011), with d'Alembert's formula.
 """
 
 from __future__ import annotations

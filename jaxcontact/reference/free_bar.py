@@ -10,7 +10,7 @@ r = min(q, 2L - q) its place:
 
 At q = 2L the bar leaves without strain at exactly +v0.
 
-Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) for the bar; d'Alembert.
+Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011), with d'Alembert's formula.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ With the load P per axial length, radius R and E* = E/(1 - nu^2):
 
     a = sqrt(4 P R / (pi E*)),   p0 = 2 P / (pi a),   p(x) = p0 sqrt(1 - x^2/a^2) for |x| <= a.
 
-Source: K. L. Johnson, Contact Mechanics, Cambridge University Press 1985, section 4.2(c).
+Source: K. L. Johnson, Contact Mechanics, Cambridge University Press (1985), section 4.2(c).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Plain: one scan over T steps. With `save_every = k`, a scan over T/k blocks of k
 only the last state is recorded. With checkpoints, a scan over segments of blocks: the backward
 pass keeps the state at the start of each segment and recomputes what happened inside, so that with
 sqrt(T) segments it holds O(sqrt(T)) steps at a time. Source: Griewank, Walther, Evaluating
-Derivatives (2008), 12; two levels, as one scan inside the other.
+Derivatives (2008), 12, with two levels, one scan inside the other.
 """
 
 from __future__ import annotations
