@@ -1,7 +1,8 @@
-"""Claims about the benchmarks: they run from the command line and keep what they measured."""
+"""Claims about the benchmarks: all are listed, they run and keep what they measured."""
 
 import importlib
 import json
+import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -18,6 +19,15 @@ RESULTS = {
     "compile_time": ["forward_s", "gradient_s"],
     "contact_solvers": ["newton_cold_us", "newton_warm_us", "gauss_seidel_us"],
 }
+
+
+def test_benchmark_index_has_a_row_for_every_script_and_every_result():
+    index = (FOLDER / "README.md").read_text(encoding="utf-8")
+    rows = [line for line in index.splitlines() if re.match(r"\|.*`\w+\.py`", line)]
+    scripts = sorted(path.name for path in FOLDER.glob("*.py"))
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+\.py)`", row)) == scripts
+    named = {name for row in rows for name in re.findall(r"`(\w+\.(?:json|png))`", row)}
+    assert named == {path.name for path in (FOLDER / "results").iterdir()}
 
 
 @pytest.mark.slow
