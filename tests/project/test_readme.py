@@ -4,8 +4,6 @@ import sys
 import tomllib
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -38,8 +36,3 @@ def test_readme_commands_install_extras_that_exist():
 def test_readme_and_continuous_integration_share_the_test_command():
     pattern = re.search(r"grep -E '(.*)' README.md", (ROOT / ".ci" / "run").read_text()).group(1)
     assert len(re.findall(pattern, README, flags=re.MULTILINE)) == 1
-
-
-@pytest.mark.parametrize("name", re.findall(r"`((?:\w+/)*\w+\.(?:py|ipynb))`", README))
-def test_readme_names_files_that_exist(name):
-    assert (ROOT / "jaxcontact" / name).exists() or (ROOT / name).exists()

@@ -1,4 +1,4 @@
-"""Every source that the package names can be looked up."""
+"""Every source and every file that the texts name can be looked up."""
 
 import ast
 import re
@@ -9,6 +9,12 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGE = sorted((ROOT / "jaxcontact").rglob("*.py"))
 PAGES = {path.name: path for folder in (ROOT, ROOT / "notebooks") for path in folder.glob("*.md")}
+
+TREE = [
+    path.relative_to(ROOT).as_posix()
+    for folder in ("jaxcontact", "tests", "notebooks", "benchmarks")
+    for path in (ROOT / folder).rglob("*.*")
+]
 
 PAPER = re.compile(r"\bpaper\b|\([2-4]\.\d+[a-e]?\)")
 PUBLICATION = re.compile(r"\((1[5-9]|20)\d\d\)")
@@ -64,6 +70,16 @@ def test_every_page_that_the_package_mentions_exists():
     mentioned = {page for path in PACKAGE for page in PAGE.findall(path.read_text("utf-8"))}
     assert ("MATH.md", "2") in mentioned
     assert not {page for page in mentioned if not is_page(*page)}
+
+
+def test_every_file_that_a_text_names_exists():
+    missing = [
+        f"{text.relative_to(ROOT)}: {name}"
+        for text in [*PACKAGE, *PAGES.values(), ROOT / "benchmarks" / "README.md"]
+        for name in re.findall(r"`((?:\w+/)*\w+\.(?:py|ipynb))`", text.read_text("utf-8"))
+        if not any(f"/{file}".endswith(f"/{name}") for file in TREE)
+    ]
+    assert not missing, "\n".join(missing)
 
 
 @pytest.mark.parametrize(
