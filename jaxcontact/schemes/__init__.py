@@ -1,4 +1,4 @@
-"""Time-stepping schemes: each an option object on one factor and one contact problem per step."""
+"""Time-stepping schemes: each an option object with one or two contact problems per step."""
 
 from jaxcontact.schemes.backward_euler import BackwardEuler
 from jaxcontact.schemes.contact_implicit import ContactImplicit
