@@ -47,3 +47,43 @@ def test_contributed_linear_solver_hands_over_by_the_number_of_unknowns(example,
     system = jc.discretize(jc.Scene(body, jc.KelvinVoigt(young=100.0, poisson=0.3)))
     factor = example["DenseUpTo"](limit).factorize(system.mass.expand(), system.normals)
     assert isinstance(factor, expected)
+
+
+@pytest.fixture(scope="module")
+def bounce():
+    """The step length and the motion of a thrown block by any scheme."""
+    body = jc.meshes.rectangle((1.0, 1.0), h=0.5)
+    scene = jc.Scene(
+        body,
+        jc.KelvinVoigt(young=100.0, poisson=0.3, shear_viscosity=0.1),
+        contact={"bottom": jc.HalfSpace([0.0, -0.1], [0.0, 1.0])},
+    )
+    system = jc.discretize(scene)
+    still = np.zeros(body.points.shape)
+    thrown = jc.State(displacement=still, velocity=still - np.array([0.0, 1.0]))
+
+    def run(scheme):
+        stepper = jc.prepare(system, 0.02, scheme=scheme)
+        return stepper, jc.simulate(stepper, steps=30, initial=thrown)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("theta", "scheme"), [(0.5, jc.ContactImplicit()), (1.0, jc.BackwardEuler())]
+)
+def test_contributed_scheme_ends_at_the_two_schemes_that_it_lies_between(
+    example, bounce, theta, scheme
+):
+    (_, motion), (_, expected) = bounce(example["Theta"](theta)), bounce(scheme)
+    assert expected.active.any()
+    for record in ("displacement", "velocity", "contact_impulse"):
+        np.testing.assert_allclose(
+            getattr(motion, record), getattr(expected, record), rtol=1e-9, atol=1e-11
+        )
+
+
+def test_contributed_scheme_balances_its_energy(example, bounce):
+    ledger = jc.energy(*bounce(example["Theta"](0.7)))
+    assert np.sum(ledger.numerical_loss) > 0.01 * ledger.total[0]
+    assert np.max(np.abs(ledger.residual)) < 1e-12 * ledger.total[0]
