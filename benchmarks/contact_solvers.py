@@ -68,7 +68,7 @@ SOLVERS = {
 def measure_pairs(pairs: int, steps: int, dtype: Any, repeats: int) -> dict[str, Any]:
     """Return one row: all solvers on one compliance."""
     body = flat_box(pairs, dtype)
-    compliance = speed_scenes.prepare(body).operators.problem.factor.compliance
+    compliance = speed_scenes.prepare(body).operators.problem.form.factor.compliance
     offset = offsets(body, steps)
     row: dict[str, Any] = {**body.sizes, "steps": steps}
     eigenvalues = np.linalg.eigvalsh(np.asarray(compliance, float))

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING
 from jaxcontact import reference
 from jaxcontact.contact import (
     AlongDirection,
+    ClosedBranch,
     CriticalCone,
-    Inactive,
+    OpenBranch,
     ProjectedGaussSeidel,
     RelaxedContact,
     SemismoothNewton,
     Status,
-    Strong,
-    with_contact,
 )
 from jaxcontact.control import scenes
 from jaxcontact.control.cost import TrackingCost, contact_force, contact_force_error, contact_time
@@ -27,6 +26,7 @@ from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
+    Verdict,
     check_gradient,
     derivative_report,
     directional_derivative,
@@ -38,7 +38,7 @@ from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
 from jaxcontact.motion.pressure import contact_pressure
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
-from jaxcontact.motion.stepper import Stepper, prepare
+from jaxcontact.motion.stepper import Stepper, prepare, with_contact
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.optimize import (
     LBFGS,
@@ -87,6 +87,7 @@ __all__ = [
     "BackwardEuler",
     "Ball",
     "Checkpoint",
+    "ClosedBranch",
     "ConjugateGradient",
     "ContactImplicit",
     "ContactStabilized",
@@ -106,6 +107,7 @@ __all__ = [
     "Mesh",
     "NestedDissection",
     "NewtonCG",
+    "OpenBranch",
     "Optax",
     "ProjectedGaussSeidel",
     "RedistributedMass",
@@ -126,6 +128,7 @@ __all__ = [
     "TrackingCost",
     "Trajectory",
     "Trapezoidal",
+    "Verdict",
     "WeakWolfe",
     "actuator",
     "boundary_actuator",
@@ -157,6 +160,9 @@ __all__ = [
     "stationarity",
     "with_contact",
 ]
+
+#: The first names of the two branches of the derivative.
+Strong, Inactive = ClosedBranch, OpenBranch
 
 #: Loaded when they are asked for: a simulation needs no pictures and no files.
 _LAZY = {"plot": "jaxcontact.output.plot", "export": "jaxcontact.output.export"}

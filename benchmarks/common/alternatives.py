@@ -22,7 +22,7 @@ def penalty(stepper: jc.Stepper, initial: jc.State, control: Array) -> Array:
     """
     dt, normals = stepper.dt, stepper.system.normals
     problem = stepper.operators.problem
-    stiffness = 0.5 / (dt**2 * jnp.diagonal(problem.factor.compliance))
+    stiffness = 0.5 / (dt**2 * jnp.diagonal(problem.form.factor.compliance))
 
     def step(state: tuple[Array, Array], force: Array):
         y, v = state
@@ -32,7 +32,7 @@ def penalty(stepper: jc.Stepper, initial: jc.State, control: Array) -> Array:
         w = jax.lax.custom_linear_solve(
             lambda x: problem.matrix @ x,
             rhs,
-            lambda _, r: problem.factor.solve(r),
+            lambda _, r: problem.form.factor.solve(r),
             symmetric=True,
         )
         return (y + dt * w, 2.0 * w - v), y + dt * w
@@ -46,7 +46,7 @@ def unrolled_gauss_seidel(
     """Return displacements (T+1, N, d) where autodiff runs through every relaxation of a pair."""
     dt, normals = stepper.dt, stepper.system.normals
     problem = stepper.operators.problem
-    compliance = problem.factor.compliance
+    compliance = problem.form.factor.compliance
     diagonal = jnp.diagonal(compliance)
     order = jnp.tile(jnp.arange(diagonal.shape[0]), sweeps)
 
@@ -54,7 +54,7 @@ def unrolled_gauss_seidel(
         return jax.lax.custom_linear_solve(
             lambda x: problem.matrix @ x,
             rhs,
-            lambda _, r: problem.factor.solve(r),
+            lambda _, r: problem.form.factor.solve(r),
             symmetric=True,
         )
 

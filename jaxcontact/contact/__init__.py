@@ -1,33 +1,35 @@
 """The contact problem of one time step: its solvers, and its derivative on the critical cone."""
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
+from jaxcontact.contact.form import ContactForm, contact_form
 from jaxcontact.contact.gauss_seidel import ProjectedGaussSeidel
 from jaxcontact.contact.newton import SemismoothNewton
-from jaxcontact.contact.relaxed import RelaxedContact, with_contact
-from jaxcontact.contact.vi import ContactProblem
+from jaxcontact.contact.relaxed import RelaxedContact
+from jaxcontact.contact.vi import Bound, ContactProblem, Perturbation
 from jaxcontact.contact.weak import (
     AlongDirection,
+    ClosedBranch,
     CriticalCone,
-    Inactive,
-    OnBranch,
-    Strong,
+    OpenBranch,
     WeakContact,
 )
 
 __all__ = [
     "AlongDirection",
+    "Bound",
+    "ClosedBranch",
+    "ContactForm",
     "ContactProblem",
     "ContactSolver",
     "CriticalCone",
     "Guess",
-    "Inactive",
-    "OnBranch",
+    "OpenBranch",
+    "Perturbation",
     "ProjectedGaussSeidel",
     "RelaxedContact",
     "SemismoothNewton",
     "Solution",
     "Status",
-    "Strong",
     "WeakContact",
-    "with_contact",
+    "contact_form",
 ]

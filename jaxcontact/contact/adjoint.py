@@ -24,10 +24,11 @@ from jax.custom_derivatives import custom_vjp_primal_tree_values
 
 from jaxcontact.contact.complementarity import Solution
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
-from jaxcontact.contact.tangent import instantiate, linear_contact, solve_forward
-from jaxcontact.contact.weak import Strong
+from jaxcontact.contact.tangent import linear_contact, solve_forward
+from jaxcontact.contact.weak import ClosedBranch
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.symmetric_product import outer_on_pattern
+from jaxcontact.transforms.tangents import instantiate
 
 
 class Residuals(NamedTuple):
@@ -56,11 +57,11 @@ class Residuals(NamedTuple):
     """Entries of N (the same in every step, stored once)."""
 
     fixed: Fixed
-    """Patterns and the factor (the same in every step, stored once)."""
+    """Patterns, factor and contact solver (the same in every step, stored once)."""
 
 
 #: Algorithm 1 of the paper: the whole active set counts as strong contact.
-ALGORITHM_1 = Strong()
+ALGORITHM_1 = ClosedBranch()
 
 
 @jax.custom_vjp
@@ -87,7 +88,7 @@ def _solve_fwd(*arguments):
         values=values,
         weights=weights,
         # What changes from step to step and is not needed again.
-        fixed=fixed._replace(guess=None, resolution=None),
+        fixed=fixed._replace(resolution=None, guess=None, is_open=None),
     )
     return (w, solution), residuals
 

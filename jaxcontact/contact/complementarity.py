@@ -10,7 +10,7 @@ Source: MATH.md 2.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ class Status(IntEnum):
 
     CONVERGED = 0
     FALLBACK = 1
-    """Converged, but by the safeguard (projected Gauss-Seidel) instead of the chosen method."""
+    """Converged, but by the safeguard of the chosen method."""
     NOT_CONVERGED = 2
     NON_FINITE = 3
 
@@ -38,8 +38,8 @@ class Guess(NamedTuple):
     active: Array
     """Active set to start from, (C,) bool."""
 
-    memory: Any = ()
-    """What else the contact solver keeps, see `ContactSolver.first_memory`."""
+    workspace: Any = ()
+    """What else the contact solver keeps, see `ContactSolver.first_workspace`."""
 
 
 class Solution(NamedTuple):
@@ -60,8 +60,11 @@ class Solution(NamedTuple):
     residual: Array
     """KKT residual relative to the largest violation of the free motion, scalar."""
 
-    memory: Any = ()
+    workspace: Any = ()
     """What the contact solver hands to the next step; never differentiated."""
+
+    separation: Any = ()
+    """b - N w, the velocity at which each pair separates, (C,); set by `ContactProblem.solve`."""
 
     @property
     def weak(self) -> Array:
@@ -71,13 +74,22 @@ class Solution(NamedTuple):
     @property
     def guess(self) -> Guess:
         """Where the next step starts."""
-        return Guess(self.active, self.memory)
+        return Guess(self.active, self.workspace)
 
 
+@runtime_checkable
 class ContactSolver(Protocol):
     """An option object: a pytree; `jax.tree_util.register_static` if it holds no array."""
 
-    def first_memory(self, compliance: Array) -> Any:
+    is_exact: ClassVar[bool]
+    """Whether contact is rigid, p g = 0; if not, `softness` enters the derivative."""
+
+    @property
+    def max_active_sets(self) -> int | None:
+        """Active sets to try where contact cannot be condensed; None if the solver needs W."""
+        ...
+
+    def first_workspace(self, compliance: Array) -> Any:
         """Return what the solver keeps between the steps of W, (C, C); () if nothing."""
         ...
 
@@ -88,13 +100,24 @@ class ContactSolver(Protocol):
             compliance: W, (C, C) SPD.
             offset: q, (C,).
             resolution: rounding error of q, (C,); smaller values are zero.
-            guess: where to start; its memory may be missing.
+            guess: where to start; its workspace may be missing.
         """
         ...
 
-    def softness(self, solution_multiplier: Array, separation: Array) -> Array | None:
-        """Return dg/dp of the contact law, (C,), or None if contact is exact (rigid)."""
+    def softness(self, multiplier: Array, separation: Array) -> Array:
+        """Return dg/dp of the contact law at p and g, (C,); zero where contact is rigid."""
         ...
+
+
+def rank_shift(compliance: Array) -> float:
+    """Return what is added to the unit diagonal of the scaled compliance before it is factorised.
+
+    Pairs that lean on each other (nearly equal planes at a corner, more planes at a node than it
+    has components) make W singular. The shift e lets them share the force at the price of a
+    relative error e / s in a direction of singular value s, which each refinement with W itself
+    multiplies by e / s once more; its own rounding error is eps / e.
+    """
+    return float(jnp.finfo(compliance.dtype).eps) ** (5 / 8)
 
 
 def separation(compliance: Array, offset: Array, multiplier: Array) -> Array:
@@ -114,7 +137,7 @@ def tolerance(offset: Array, resolution: Array) -> Array:
     return RELATIVE_TOLERANCE[str(offset.dtype)] * violation + 4.0 * resolution
 
 
-def solve_on_set(compliance: Array, active: Array, softness: Array | None, rhs: Array) -> Array:
+def solve_compliance(compliance: Array, active: Array, softness: Array | None, rhs: Array) -> Array:
     """Return p with (W p + softness p)_i = rhs_i on the active set and p_i = rhs_i elsewhere.
 
     Args:
@@ -129,8 +152,24 @@ def solve_on_set(compliance: Array, active: Array, softness: Array | None, rhs: 
     scale = jax.lax.rsqrt(jnp.where(active, jnp.diagonal(compliance), 0.0) + diagonal)
     matrix = jnp.where(inside, compliance, 0.0) * scale[:, None] * scale[None, :]
     matrix = matrix + jnp.diag(diagonal.astype(compliance.dtype) * scale**2)
-    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-    return scale * jax.scipy.linalg.cho_solve(factor, scale * rhs)
+    shift = rank_shift(compliance)
+    factor = jax.scipy.linalg.cho_factor(matrix + shift * jnp.eye(len(scale)), lower=True)
+    solution = jnp.zeros_like(rhs)
+    # The last two passes take the shift out again.
+    for _ in range(3):
+        rest = scale * rhs - matrix @ solution
+        solution = solution + jax.scipy.linalg.cho_solve(factor, rest)
+    return scale * solution
+
+
+def last_of(pairs: Array) -> Array:
+    """Return the last one of a set of pairs, (C,) bool: Murty's rule moves it alone.
+
+    From any set of an SPD problem, moving the last pair with a wrong sign ends at the solution
+    after finitely many sets. Source: Murty, Opsearch 11 (1974) 3-21.
+    """
+    numbers = jnp.arange(pairs.shape[0])
+    return numbers == jnp.max(jnp.where(pairs, numbers, -1), initial=-1)
 
 
 def finish(

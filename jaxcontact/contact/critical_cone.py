@@ -12,19 +12,45 @@ solve. Source: paper, Theorem 4.20; Judice, Pires, Computers Ops Res. 21 (1994) 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact.complementarity import RELATIVE_TOLERANCE
+from jaxcontact.contact.complementarity import RELATIVE_TOLERANCE, last_of
 
 #: Block steps that may pass without fewer wrong signs, before pairs are moved one at a time.
 PATIENCE = 5
 
 
+class _Search(NamedTuple):
+    """The pivoting over sets of closed pairs."""
+
+    active: Array
+    """The set, (C,) bool."""
+
+    wrong: Array
+    """Weak pairs with a wrong sign on it, (C,) bool."""
+
+    fewest: Array
+    """Fewest wrong signs so far, int32."""
+
+    patience: Array
+    """Block steps that may still pass without fewer, int32."""
+
+    w: Array
+    """dw on the set, (n,)."""
+
+    p: Array
+    """dp on the set, (C,)."""
+
+    steps: Array
+    """Sets so far, int32."""
+
+
 def solve(
-    solve_on_set: Callable[[Array], tuple[Array, Array, Array]],
+    solve_with: Callable[[Array], tuple[Array, Array, Array]],
     strong: Array,
     weak: Array,
     compliance: Array,
@@ -32,7 +58,7 @@ def solve(
     """Solve the VI on the critical cone.
 
     Args:
-        solve_on_set: maps A, (C,) bool, to dw (n,), dp (C,) and db - N dw (C,) of the linear
+        solve_with: maps A, (C,) bool, to dw (n,), dp (C,) and db - N dw (C,) of the linear
             problem with equality on A.
         strong: S, (C,) bool.
         weak: W, (C,) bool.
@@ -44,36 +70,25 @@ def solve(
     n_pairs = strong.shape[0]
     relative_tolerance = RELATIVE_TOLERANCE[str(compliance.dtype)]
 
-    def is_wrong(active, p, gap):
+    def try_set(active: Array) -> tuple[Array, Array, Array]:
+        w, p, gap = solve_with(active)
         size = jnp.max(jnp.where(strong | weak, jnp.abs(gap) + compliance * jnp.abs(p), 0.0))
         noise = relative_tolerance * size
-        return weak & jnp.where(active, compliance * p < -noise, gap < -noise)
+        return weak & jnp.where(active, compliance * p < -noise, gap < -noise), w, p
 
-    def is_unfinished(carry):
-        _, wrong, _, _, _, _, steps = carry
-        return jnp.any(wrong) & (steps < 50 + 10 * n_pairs)
+    def is_unfinished(search: _Search) -> Array:
+        return jnp.any(search.wrong) & (search.steps < 50 + 10 * n_pairs)
 
-    def advance(carry):
-        active, wrong, best, patience, _, _, steps = carry
-        count = jnp.sum(wrong)
-        is_better = count < best
-        patience = jnp.where(is_better, PATIENCE, patience - 1)
-        is_last = jnp.arange(n_pairs) == jnp.max(jnp.where(wrong, jnp.arange(n_pairs), 0))
-        moved = active ^ jnp.where(patience > 0, wrong, is_last)
-        w, p, gap = solve_on_set(moved)
-        best = jnp.minimum(best, count)
-        return moved, is_wrong(moved, p, gap), best, patience, w, p, steps + 1
+    def advance(search: _Search) -> _Search:
+        count = jnp.sum(search.wrong)
+        patience = jnp.where(count < search.fewest, PATIENCE, search.patience - 1)
+        moved = search.active ^ jnp.where(patience > 0, search.wrong, last_of(search.wrong))
+        wrong, w, p = try_set(moved)
+        fewest = jnp.minimum(search.fewest, count)
+        return _Search(moved, wrong, fewest, patience, w, p, search.steps + 1)
 
-    w, p, gap = solve_on_set(strong)
-    start = (
-        strong,
-        is_wrong(strong, p, gap),
-        jnp.array(n_pairs + 1),
-        jnp.array(PATIENCE),
-        w,
-        p,
-        jnp.int32(0),
-    )
-    _, wrong, _, _, w, p, _ = jax.lax.while_loop(is_unfinished, advance, start)
-    poison = jnp.where(jnp.any(wrong), jnp.nan, 1.0).astype(w.dtype)
-    return w * poison, p * poison
+    wrong, w, p = try_set(strong)
+    start = _Search(strong, wrong, jnp.array(n_pairs + 1), jnp.array(PATIENCE), w, p, jnp.int32(0))
+    found = jax.lax.while_loop(is_unfinished, advance, start)
+    poison = jnp.where(jnp.any(found.wrong), jnp.nan, 1.0).astype(w.dtype)
+    return found.w * poison, found.p * poison

@@ -9,6 +9,7 @@ Stone, The Linear Complementarity Problem (1992), 5.2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +55,13 @@ class ProjectedGaussSeidel:
     max_sweeps: int = 20_000
     """A step that needs more sweeps ends as not converged."""
 
-    def first_memory(self, compliance: Array) -> tuple[()]:
+    is_exact: ClassVar[bool] = True
+
+    @property
+    def max_active_sets(self) -> None:
+        """None: it works on the condensed compliance."""
+
+    def first_workspace(self, compliance: Array) -> tuple[()]:
         """Return (): nothing is kept between steps."""
         return ()
 
@@ -69,5 +76,6 @@ class ProjectedGaussSeidel:
             compliance, offset, resolution, multiplier, sweeps, jnp.bool_(False)
         )
 
-    def softness(self, solution_multiplier: Array, separation: Array) -> None:
-        """Return None: contact is exact."""
+    def softness(self, multiplier: Array, separation: Array) -> Array:
+        """Return zero: contact is rigid."""
+        return jnp.zeros_like(multiplier)

@@ -7,12 +7,17 @@ inverse of the compliance. For systems too large to factorise.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact.complementarity import (
     RELATIVE_TOLERANCE,
+    ContactSolver,
+    Guess,
     Solution,
     Status,
 )
@@ -20,63 +25,99 @@ from jaxcontact.linear import ConstrainedFactor
 from jaxcontact.system.sparse import ContactNormals
 
 
-def solve_contact(
-    factor: ConstrainedFactor,
-    max_steps: int,
-    rhs: Array,
-    bound: Array,
-    resolution: Array,
-    guess: Array,
-) -> tuple[Array, Solution]:
-    """Solve the VI of a step by active sets and conjugate gradients.
+class _Search(NamedTuple):
+    """The iteration over active sets."""
 
-    Args:
-        factor: the matrix with its preconditioner.
-        max_steps: number of active sets before the step counts as not converged.
-        rhs: r, (n,).
-        bound: b, (C,).
-        resolution: rounding error of the bound, (C,).
-        guess: active set to start from, (C,) bool.
+    active: Array
+    """The next active set, (C,) bool."""
 
-    Returns:
-        w (n,) and the solution on the contact pairs; the iterations count active sets.
-    """
-    normals = factor.normals
-    # Approximate compliance, for scaling only: it does not enter the solution.
-    compliance = factor.approximate_compliance
+    w: Array
+    """Solution on the last active set, (n,)."""
 
-    def violation(w: Array) -> Array:
-        return normals @ w - bound
+    multiplier: Array
+    """Its multiplier, (C,)."""
 
-    def is_unfinished(carry):
-        _, _, _, is_repeated, steps = carry
-        return ~is_repeated & (steps < max_steps)
+    is_repeated: Array
+    """Whether the last active set was found again, bool."""
 
-    # The solver stops at a relative error, so gaps below it do not move a pair in or out.
-    def advance(carry):
-        active, _, _, _, steps = carry
-        w, p = factor.solve_constrained(active, rhs, bound)
-        noise = resolution + RELATIVE_TOLERANCE[str(rhs.dtype)] * _magnitude(normals, w)
-        stays = active & (compliance * p >= -noise)
-        enters = ~active & (violation(w) > noise)
-        following = stays | enters
-        return following, w, p, jnp.all(following == active), steps + 1
+    steps: Array
+    """Active sets so far, int32."""
 
-    start = (guess, jnp.zeros_like(rhs), jnp.zeros_like(bound), jnp.bool_(False), jnp.int32(0))
-    active, w, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
 
-    relative_tolerance = RELATIVE_TOLERANCE[str(rhs.dtype)]
-    scale = _magnitude(normals, w) + resolution / relative_tolerance
-    # Clipping a multiplier within the noise changes the balance of forces by as little.
-    clipped = jnp.maximum(p, 0.0)
-    error = jnp.abs(jnp.minimum(compliance * clipped, -violation(w)))
-    residual = jnp.max(error / jnp.maximum(scale, jnp.finfo(rhs.dtype).tiny))
-    is_finite = jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(p))
-    is_solved = is_repeated & (residual <= 4.0 * relative_tolerance)
-    status = jnp.where(is_solved, Status.CONVERGED, Status.NOT_CONVERGED)
-    status = jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32)
-    is_closed = active | (-violation(w) <= relative_tolerance * scale)
-    return w, Solution(clipped, is_closed, steps, status, residual)
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MatrixFreeContact:
+    """A matrix that is solved with by iteration, with exact contact; see `ContactForm`."""
+
+    factor: ConstrainedFactor
+    """The matrix with its preconditioner."""
+
+    contact_solver: ContactSolver
+    """The option that was chosen."""
+
+    max_active_sets: int = field(metadata={"static": True})
+    """Active sets before a step counts as not converged."""
+
+    @property
+    def compliance_scale(self) -> Array:
+        """Approximate diagonal of the compliance, (C,)."""
+        return self.factor.approximate_compliance
+
+    def first_guess(self) -> Guess:
+        """Return no pair in contact."""
+        return Guess(jnp.zeros(self.factor.normals.count, bool))
+
+    def solve(
+        self, rhs: Array, bound: Array, resolution: Array, guess: Guess
+    ) -> tuple[Array, Solution]:
+        """Solve the VI of a step; the iterations of the solution count active sets."""
+        normals, compliance = self.factor.normals, self.compliance_scale
+        relative_tolerance = RELATIVE_TOLERANCE[str(rhs.dtype)]
+
+        def violation(w: Array) -> Array:
+            return normals @ w - bound
+
+        def is_unfinished(search: _Search) -> Array:
+            return ~search.is_repeated & (search.steps < self.max_active_sets)
+
+        # The solver stops at a relative error, so gaps below it do not move a pair in or out.
+        def advance(search: _Search) -> _Search:
+            active = search.active
+            w, p = self.factor.solve_constrained(active, rhs, bound)
+            noise = resolution + relative_tolerance * _magnitude(normals, w)
+            stays = active & (compliance * p >= -noise)
+            enters = ~active & (violation(w) > noise)
+            following = stays | enters
+            return _Search(following, w, p, jnp.all(following == active), search.steps + 1)
+
+        start = _Search(
+            active=guess.active,
+            w=jnp.zeros_like(rhs),
+            multiplier=jnp.zeros_like(bound),
+            is_repeated=jnp.bool_(False),
+            steps=jnp.int32(0),
+        )
+        active, w, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
+
+        scale = _magnitude(normals, w) + resolution / relative_tolerance
+        # Clipping a multiplier within the noise changes the balance of forces by as little.
+        clipped = jnp.maximum(p, 0.0)
+        error = jnp.abs(jnp.minimum(compliance * clipped, -violation(w)))
+        residual = jnp.max(error / jnp.maximum(scale, jnp.finfo(rhs.dtype).tiny))
+        is_finite = jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(p))
+        is_solved = is_repeated & (residual <= 4.0 * relative_tolerance)
+        status = jnp.where(is_solved, Status.CONVERGED, Status.NOT_CONVERGED)
+        status = jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32)
+        is_closed = active | (-violation(w) <= relative_tolerance * scale)
+        return w, Solution(clipped, is_closed, steps, status, residual)
+
+    def solve_on_set(
+        self, pairs: Array, softness: Array | None, rhs: Array, bound: Array
+    ) -> tuple[Array, Array]:
+        """Solve the linear problem of known pairs; the contact is exact, softness is not read."""
+        del softness
+        w, p = self.factor.solve_constrained(pairs, rhs, bound)
+        return w, jnp.where(pairs, p, bound)
 
 
 def _magnitude(normals: ContactNormals, w: Array) -> Array:

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.contact.complementarity import rank_shift
 from jaxcontact.linear.triangular import invert_triangular
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -95,7 +96,8 @@ def solve(
     error = jnp.where(pairs, compliance @ p + offset, 0.0)
     size = jnp.max(jnp.diagonal(compliance) * jnp.abs(p))
     # Not fine is also what is not a number.
-    is_fine = jnp.max(jnp.abs(error)) <= 0.1 * jnp.finfo(p.dtype).eps ** 0.5 * size
+    limit = 0.1 * jnp.finfo(p.dtype).eps ** 0.5 + 2.0 * rank_shift(compliance)
+    is_fine = jnp.max(jnp.abs(error)) <= limit * size
     exchanges = jnp.where(~is_fine & (pivoted.exchanges > 0), WORN, pivoted.exchanges)
     return p + on_set(error), pivoted._replace(exchanges=exchanges)
 
@@ -155,7 +157,8 @@ def _transform(compliance: Array, pairs: Array) -> Array:
     identity = jnp.eye(pairs.shape[0], dtype=compliance.dtype)
     inside = pairs[:, None] & pairs[None, :]
     across = jnp.where(pairs[:, None] & ~pairs[None, :], scaled, 0.0)
-    L = jax.lax.linalg.cholesky(jnp.where(inside, scaled, identity), symmetrize_input=False)
+    shifted = jnp.where(inside, scaled, identity) + rank_shift(compliance) * identity
+    L = jax.lax.linalg.cholesky(shifted, symmetrize_input=False)
     L_inverse = invert_triangular(L[None])[0]
     inverse = jnp.where(inside, L_inverse.T @ L_inverse, 0.0)
     elimination = inverse @ across

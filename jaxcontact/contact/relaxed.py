@@ -21,7 +21,7 @@ contact the share of the multiplier. Source: MATH.md 5; Forsgren, Gill, Wright, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +29,11 @@ from jax import Array
 
 from jaxcontact.contact import complementarity
 from jaxcontact.contact.complementarity import (
-    ContactSolver,
     Guess,
     Solution,
     Status,
     separation,
-    solve_on_set,
+    solve_compliance,
 )
 
 #: Halvings of a Newton step before it is taken anyway.
@@ -42,6 +41,28 @@ MAX_HALVINGS = 12
 
 #: Newton steps without progress before rounding is taken to have ended the descent.
 PATIENCE = 4
+
+
+class _Descent(NamedTuple):
+    """Newton's iteration in the unknown x."""
+
+    x: Array
+    """The unknown, (C,)."""
+
+    error: Array
+    """Its residual, (C,)."""
+
+    goal: Array
+    """Rounding error of the residual, (C,)."""
+
+    best: Array
+    """Smallest merit so far, scalar."""
+
+    steps: Array
+    """Newton steps so far, int32."""
+
+    patience: Array
+    """Steps that may still pass without progress, int32."""
 
 
 @jax.tree_util.register_dataclass
@@ -65,7 +86,13 @@ class RelaxedContact:
     max_steps: int = field(default=100, metadata={"static": True})
     """Newton steps before a time step ends as not converged."""
 
-    def first_memory(self, compliance: Array) -> tuple[()]:
+    is_exact: ClassVar[bool] = False
+
+    @property
+    def max_active_sets(self) -> None:
+        """None: it works on the condensed compliance."""
+
+    def first_workspace(self, compliance: Array) -> tuple[()]:
         """Return (): nothing is kept between steps."""
         return ()
 
@@ -92,16 +119,15 @@ class RelaxedContact:
             # Rounding of a pair far from contact must not hide the descent of the others.
             return jnp.linalg.norm(jnp.maximum(jnp.abs(error) - noise(x), 0.0) / scale)
 
-        def is_unfinished(carry):
-            _, error, goal, best, steps, patience = carry
-            del best
-            return jnp.any(jnp.abs(error) > goal) & (steps < self.max_steps) & (patience > 0)
+        def is_unfinished(descent: _Descent) -> Array:
+            is_open = jnp.any(jnp.abs(descent.error) > descent.goal)
+            return is_open & (descent.steps < self.max_steps) & (descent.patience > 0)
 
-        def advance(carry):
-            x, error, _, best, steps, patience = carry
+        def advance(descent: _Descent) -> _Descent:
+            x, error = descent.x, descent.error
             p, g, root = _pair(x, diagonal, kappa)
             everywhere = jnp.ones(x.shape, bool)
-            direction = solve_on_set(compliance, everywhere, g / p, -error) * (root / p)
+            direction = solve_compliance(compliance, everywhere, g / p, -error) * (root / p)
             old_size = merit(x, error)
 
             def is_too_long(trial):
@@ -119,21 +145,22 @@ class RelaxedContact:
             x = x + t * direction
             size = merit(x, new_error)
             # Rounding ends the descent: a few steps without progress are enough.
-            patience = jnp.where(size < 0.95 * best, PATIENCE, patience - 1)
-            return x, new_error, noise(x), jnp.minimum(best, size), steps + 1, patience
+            patience = jnp.where(size < 0.95 * descent.best, PATIENCE, descent.patience - 1)
+            best = jnp.minimum(descent.best, size)
+            return _Descent(x, new_error, noise(x), best, descent.steps + 1, patience)
 
-        multiplier = solve_on_set(compliance, closed, None, jnp.where(closed, -offset, 0.0))
+        multiplier = solve_compliance(compliance, closed, None, jnp.where(closed, -offset, 0.0))
         x = diagonal * multiplier - separation(compliance, offset, multiplier)
         error = residual(x)
-        start = (x, error, noise(x), merit(x, error), jnp.int32(0), jnp.int32(PATIENCE))
+        start = _Descent(x, error, noise(x), merit(x, error), jnp.int32(0), jnp.int32(PATIENCE))
         x, error, goal, _, steps, _ = jax.lax.while_loop(is_unfinished, advance, start)
         multiplier, _, _ = _pair(x, diagonal, kappa)
         goal = 64.0 * goal + complementarity.tolerance(offset, resolution)
         return _finish(multiplier, x, error, goal, steps)
 
-    def softness(self, solution_multiplier: Array, separation: Array) -> Array:
+    def softness(self, multiplier: Array, separation: Array) -> Array:
         """Return dg/dp = g / p = kappa / p^2, (C,)."""
-        return self.kappa / solution_multiplier**2
+        return self.kappa / multiplier**2
 
 
 def _pair(x: Array, diagonal: Array, kappa: Array) -> tuple[Array, Array, Array]:
@@ -154,35 +181,3 @@ def _finish(multiplier: Array, x: Array, error: Array, goal: Array, steps: Array
     relative_tolerance = complementarity.RELATIVE_TOLERANCE[str(x.dtype)]
     relative = relative_tolerance * jnp.max(error / jnp.maximum(goal, jnp.finfo(x.dtype).tiny))
     return Solution(multiplier, x > 0.0, steps, status, relative)
-
-
-def with_contact(tree: Any, contact_solver: ContactSolver) -> Any:
-    """Return a pytree in which every contact problem is solved by another contact solver.
-
-    Args:
-        tree: a stepper, or anything that holds one: an objective given as `jax.tree_util.Partial`
-            of a function and a stepper, a problem such as `scenes.half_disc_control`.
-        contact_solver: the solver to put in.
-
-    Raises:
-        ValueError: if the tree holds no contact solver.
-    """
-    found = []
-
-    def is_solver(node: Any) -> bool:
-        return hasattr(node, "solve") and hasattr(node, "softness")
-
-    def replace(node: Any) -> Any:
-        if not is_solver(node):
-            return node
-        found.append(node)
-        return contact_solver
-
-    changed = jax.tree.map(replace, tree, is_leaf=is_solver)
-    if not found:
-        raise ValueError(
-            "there is no stepper in this pytree to exchange the contact solver of; hand over a "
-            "bound method of a pytree that holds the stepper, such as problem.objective, or "
-            "jax.tree_util.Partial(function, stepper)"
-        )
-    return changed

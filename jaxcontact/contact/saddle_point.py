@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.contact.complementarity import ContactSolver, Guess, solve_on_set
-from jaxcontact.linear import Factor, can_condense
+from jaxcontact.contact.complementarity import Guess
+from jaxcontact.contact.form import ContactForm
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -29,17 +29,18 @@ class Fixed(NamedTuple):
     unknowns: Array | np.ndarray
     """Sparsity of N, (C, k) int32."""
 
-    factor: Factor
-    """Factor of D; the derivative by D enters through the values of the matrix instead."""
+    form: ContactForm
+    """Factor and contact solver. The derivative by D enters through the values of the matrix
+    instead, and parameters of the contact solver count as constant."""
 
-    resolution: Array
-    """Rounding error of b, (C,)."""
+    resolution: Array | None
+    """Rounding error of b, (C,); read by the forward solve only."""
 
-    guess: Guess
-    """Where the contact solver starts."""
+    guess: Guess | None
+    """Where the contact solver starts; read by the forward solve only."""
 
-    contact_solver: ContactSolver
-    """How the condensed problem is solved; its parameters count as constant."""
+    is_open: Array | None
+    """Pairs that are open in the derivative whatever their state, (C,) bool; None is none."""
 
 
 def solve_on_cone(
@@ -56,7 +57,7 @@ def solve_on_cone(
     Args:
         values: entries of D, (width, n).
         weights: entries of N, (C, k).
-        fixed: patterns and the factor.
+        fixed: patterns, factor and contact solver.
         active: A, (C,) bool.
         softness: s, (C,) or None for zero.
         rhs: dr, (n,).
@@ -80,15 +81,10 @@ def solve_on_cone(
         balance = matrix @ w + normals.transposed_product(p_active, n)
         return jnp.concatenate([balance, jnp.where(active, stretch, p)])
 
-    factor, frozen_softness = jax.lax.stop_gradient((fixed.factor, softness))
+    form, frozen_softness = jax.lax.stop_gradient((fixed.form, softness))
 
     def solve(_, data):
-        r, b = data[:n], data[n:]
-        if not can_condense(factor):
-            return jnp.concatenate(factor.solve_constrained(active, r, b))
-        partial_sweep, free = factor.condense(r)
-        p = solve_on_set(factor.compliance, active, frozen_softness, jnp.where(active, free - b, b))
-        return jnp.concatenate([factor.expand(partial_sweep, jnp.where(active, p, 0.0)), p])
+        return jnp.concatenate(form.solve_on_set(active, frozen_softness, data[:n], data[n:]))
 
     data = jnp.concatenate([rhs, jnp.where(active, bound, 0.0)])
     solution = jax.lax.custom_linear_solve(saddle_point, data, solve, symmetric=True)

@@ -10,7 +10,7 @@ derivative. Source: paper, Theorem 4.20.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +18,21 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from jaxcontact.contact import critical_cone, matrix_free
-from jaxcontact.contact.complementarity import ContactSolver, Solution
+from jaxcontact.contact import critical_cone
+from jaxcontact.contact.complementarity import Solution
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
-from jaxcontact.contact.weak import CriticalCone, OnBranch, WeakContact
-from jaxcontact.linear import can_condense
+from jaxcontact.contact.weak import WeakContact
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.forward_only import forward_only
 from jaxcontact.transforms.lasting_jvp import lasting_jvp
+from jaxcontact.transforms.tangents import instantiate
+
+#: What reverse mode of the one-sided derivative ends with.
+NO_GRADIENT = (
+    "weak_contact=CriticalCone() is the one-sided derivative, which is not linear in the "
+    "direction: it has no gradient. Use jax.jvp or directional_derivative with it, and for "
+    "jax.grad choose a linear branch: ClosedBranch(), OpenBranch() or AlongDirection(direction)"
+)
 
 
 def _solve_forward(
@@ -37,44 +44,24 @@ def _solve_forward(
     fixed: Fixed,
 ) -> tuple[Array, Solution]:
     """Solve the VI; see `ContactProblem.solve`."""
-    del weak_contact
-    contact_solver, factor = fixed.contact_solver, fixed.factor
-    if not can_condense(factor):
-        if not _is_exact(contact_solver, bound):
-            raise ValueError(
-                f"ConjugateGradient cannot solve {type(contact_solver).__name__}; prepare with "
-                "another linear_solver, such as jc.NestedDissection()"
-            )
-        return matrix_free.solve_contact(
-            factor,
-            contact_solver.max_steps,  # type: ignore
-            rhs,
-            bound,
-            fixed.resolution,
-            fixed.guess.active,
-        )
-    partial_sweep, free = factor.condense(rhs)
-    solution = contact_solver.solve(factor.compliance, bound - free, fixed.resolution, fixed.guess)
-    return factor.expand(partial_sweep, solution.multiplier), solution
+    del weak_contact, values, weights
+    assert fixed.resolution is not None
+    assert fixed.guess is not None
+    return fixed.form.solve(rhs, bound, fixed.resolution, fixed.guess)
 
 
 def _solve_forward_jvp(arguments, tangents):
     weak_contact, *primals = arguments
     _, *tangents = tangents
     values, weights, _, bound, fixed = primals
-    if isinstance(weak_contact, OnBranch) and _is_exact(fixed.contact_solver, bound):
-        # AlongDirection moves loads and states, neither matrices nor normals.
-        direction = jax.lax.stop_gradient((instantiate(tangents[2]), instantiate(tangents[3])))
-        (w, solution), (w_dot, p_dot) = _solve_on_branch(*primals, direction)
-        return (w, solution), (w_dot, _tangent(solution, p_dot))
     w, solution = solve_forward(weak_contact, *primals)
     data_dot = _linearized_data(fixed, w, solution.multiplier, tangents)
-    if isinstance(weak_contact, CriticalCone) and _is_exact(fixed.contact_solver, bound):
-        w_dot, p_dot = _solve_critical_cone(values, weights, fixed, solution, *data_dot)
-        w_dot, p_dot = forward_only(w_dot), forward_only(p_dot)
-    else:
+    if weak_contact.is_linear or not fixed.form.contact_solver.is_exact:
         pairs, softness = linear_contact(weak_contact, weights, bound, fixed, w, solution)
         w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, softness, *data_dot)
+    else:
+        w_dot, p_dot = _solve_critical_cone(values, weights, fixed, solution, *data_dot)
+        w_dot, p_dot = forward_only(w_dot, NO_GRADIENT), forward_only(p_dot, NO_GRADIENT)
     return (w, solution), (w_dot, _tangent(solution, p_dot))
 
 
@@ -91,18 +78,23 @@ def linear_contact(
     solution: Solution,
 ) -> tuple[Array, Array | None]:
     """Return the pairs (C,) bool and the softness (C,) or None of the linearised contact law."""
+    contact_solver = fixed.form.contact_solver
+    if contact_solver.is_exact:
+        return _not_open(fixed, weak_contact.equality_set(solution)), None
     separation = bound - ContactNormals(weights, fixed.unknowns) @ w
-    softness = fixed.contact_solver.softness(solution.multiplier, separation)
-    if softness is None:
-        if isinstance(weak_contact, CriticalCone | OnBranch):
-            return solution.active, None
-        return weak_contact.equality_set(solution), None
+    softness = contact_solver.softness(solution.multiplier, separation)
     # Infinitely soft pairs are open; a product with infinity would be NaN.
-    pairs = jnp.isfinite(softness)
+    pairs = _not_open(fixed, jnp.isfinite(softness))
     return pairs, jnp.where(pairs, softness, 0.0)
 
 
-def _linearized_data(fixed: Fixed, w: Array, multiplier: Array, tangents) -> tuple[Array, Array]:
+def _not_open(fixed: Fixed, pairs: Array) -> Array:
+    return pairs if fixed.is_open is None else pairs & ~fixed.is_open
+
+
+def _linearized_data(
+    fixed: Fixed, w: Array, multiplier: Array, tangents: Sequence
+) -> tuple[Array, Array]:
     """Return dr - dD w - dN^T p, (n,), and db - dN w, (C,)."""
     values_dot, weights_dot, rhs_dot, bound_dot, _ = tangents
     rhs_dot, bound_dot = instantiate(rhs_dot), instantiate(bound_dot)
@@ -120,54 +112,14 @@ def _solve_critical_cone(
 ) -> tuple[Array, Array]:
     """Return dw (n,) and dp (C,) of the one-sided derivative; not linear in rhs and bound."""
     normals = ContactNormals(weights, fixed.unknowns)
-    strong = solution.active & (solution.multiplier > 0.0)
-    weak = solution.active & ~strong
-    if not can_condense(fixed.factor):
-        compliance = fixed.factor.approximate_compliance
-    else:
-        compliance = jnp.diagonal(fixed.factor.compliance)
+    active = _not_open(fixed, solution.active)
+    strong = active & (solution.multiplier > 0.0)
 
-    def solve_on_set(pairs: Array) -> tuple[Array, Array, Array]:
+    def solve_with(pairs: Array) -> tuple[Array, Array, Array]:
         w, p = solve_on_cone(values, weights, fixed, pairs, None, rhs, bound)
         return w, p, bound - normals @ w
 
-    return critical_cone.solve(solve_on_set, strong, weak, compliance)
-
-
-def _solve_branch(values, weights, rhs, bound, fixed, direction):
-    """Solve the VI and its one-sided derivative along (dr, db).
-
-    Derivative: linear, on the pairs that the direction keeps in contact; the one-sided derivative
-    itself counts as constant.
-    """
-    w, solution = solve_forward(CriticalCone(), values, weights, rhs, bound, fixed)
-    derivative = _solve_critical_cone(values, weights, fixed, solution, *direction)
-    return (w, solution), derivative
-
-
-def _solve_branch_jvp(primals, tangents):
-    values, weights, _, _, fixed, _ = primals
-    (w, solution), derivative = _solve_on_branch(*primals)
-    pairs = solution.active & ((solution.multiplier > 0.0) | (derivative[1] > 0.0))
-    data_dot = _linearized_data(fixed, w, solution.multiplier, tangents[:5])
-    w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, None, *data_dot)
-    constant = jax.tree.map(jnp.zeros_like, derivative)
-    return ((w, solution), derivative), ((w_dot, _tangent(solution, p_dot)), constant)
-
-
-_solve_on_branch = lasting_jvp(_solve_branch, _solve_branch_jvp)
-
-
-def _is_exact(contact_solver: ContactSolver, pairs: Array) -> bool:
-    """Return whether the contact law is rigid."""
-    return contact_solver.softness(pairs, pairs) is None
-
-
-def instantiate(tangent: Any) -> Array:
-    """Return a tangent or cotangent as an array, also if it is a symbolic zero."""
-    if isinstance(tangent, SymbolicZero):
-        return jnp.zeros(tangent.aval.shape, tangent.aval.dtype)  # type: ignore
-    return tangent
+    return critical_cone.solve(solve_with, strong, active & ~strong, fixed.form.compliance_scale)
 
 
 def _tangent(solution: Solution, multiplier_dot: Array) -> Solution:

@@ -18,7 +18,7 @@ present the problem is not differentiable, and `weak.py` names the choices of A.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +26,44 @@ from jax import Array
 
 from jaxcontact.contact.adjoint import solve_with_adjoint
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
+from jaxcontact.contact.form import ContactForm
 from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
-from jaxcontact.linear import can_condense
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
+
+
+class Bound(NamedTuple):
+    """The admissible normal velocity of C pairs."""
+
+    value: Array
+    """b, (C,) [m/s]."""
+
+    resolution: Array
+    """Its rounding error, (C,) [m/s]; smaller gaps count as closed."""
+
+
+class Perturbation(NamedTuple):
+    """A change of one contact problem, zero but to be differentiated by; None is no change.
+
+    In weak contact a pair has two neighbours: an open one, where the gap is free, and a closed
+    one, where the impulse is free. To judge a motion from both sides, its derivative is taken with
+    the weak pairs open while z stands for the multiplier that they could have:
+
+        D w + N^T (p + z) = r,    N w <= b + e,    p . (b + e - N w) = 0,    z = e = 0.
+    """
+
+    bound: Array | None = None
+    """e, added to the admissible velocity, (C,) [m/s]."""
+
+    push: Array | None = None
+    """z, (C,) [N s]; positive pushes the body away from the obstacle."""
+
+    is_open: Array | None = None
+    """Pairs that are open in the derivative, whatever their state, (C,) bool."""
+
+
+NO_PERTURBATION = Perturbation()
 
 
 @jax.tree_util.register_dataclass
@@ -44,33 +77,28 @@ class ContactProblem:
     normals: ContactNormals
     """N, (C, n)."""
 
-    factor: Any
-    """Factor of D, see `linear.Factor`."""
+    form: ContactForm
+    """Factor of D and contact solver, in the form that the factor allows."""
 
-    contact_solver: ContactSolver
-    """How the condensed problem is solved."""
+    perturbation: Perturbation = NO_PERTURBATION
+    """What the VI is perturbed by."""
 
     weak_contact: WeakContact | None = field(default=None, metadata={"static": True})
     """What the derivative means where a pair is in weak contact. None is Algorithm 1, by the
     `jax.custom_vjp` of the step: reverse mode. A named treatment has forward mode too."""
 
-    def first_guess(self) -> Guess:
-        """Return where the first step starts: no pair is in contact."""
-        nothing = jnp.zeros(self.normals.count, bool)
-        if self.normals.count == 0 or not can_condense(self.factor):
-            return Guess(nothing)
-        return Guess(nothing, self.contact_solver.first_memory(self.factor.compliance))
+    @property
+    def contact_solver(self) -> ContactSolver:
+        """How the contact problem is solved."""
+        return self.form.contact_solver
 
-    def solve(
-        self, rhs: Array, bound: Array, resolution: Array, guess: Guess
-    ) -> tuple[Array, Solution]:
+    def solve(self, rhs: Array, bound: Bound, guess: Guess) -> tuple[Array, Solution]:
         """Solve the VI.
 
         Args:
             rhs: r, (n,).
-            bound: b, (C,); the admissible normal velocity.
-            resolution: rounding error of the bound, (C,); smaller gaps count as closed.
-            guess: where to start: `first_guess` or the guess of the last step's solution.
+            bound: b with its rounding error.
+            guess: where to start: `form.first_guess` or the guess of the last step's solution.
 
         Returns:
             w (n,), NaN if the problem was not solved, and the solution on the contact pairs.
@@ -81,35 +109,40 @@ class ContactProblem:
         and p only if matrix or normals are differentiated.
         """
         if self.normals.count == 0:
-            velocity = _solve_linear(self, rhs)
-            is_finite = jnp.all(jnp.isfinite(velocity))
-            status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
-            zero = jnp.zeros((), rhs.dtype)
-            return velocity, Solution(bound, guess.active, jnp.int32(0), status, zero)
+            return self._solve_without_contact(rhs, bound, guess)
+        shift, push, is_open = self.perturbation
+        value = bound.value if shift is None else bound.value + shift
+        if push is not None:
+            rhs = rhs - self.normals.transposed_product(push, rhs.shape[0])
         fixed = Fixed(
-            self.matrix.columns,
-            self.normals.unknowns,
-            self.factor,
-            resolution,
-            guess,
-            self.contact_solver,
+            self.matrix.columns, self.normals.unknowns, self.form, bound.resolution, guess, is_open
         )
-        data = (self.matrix.values, self.normals.weights, rhs, bound, fixed)
+        data = (self.matrix.values, self.normals.weights, rhs, value, fixed)
         if self.weak_contact is None:
             velocity, solution = solve_with_adjoint(*data)
         else:
             velocity, solution = solve_forward(self.weak_contact, *data)
         # Multiplication poisons value and gradient alike; a `where` would leave a zero gradient.
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(velocity.dtype)
+        multiplier = solution.multiplier if push is None else solution.multiplier + push
         return velocity * poison, solution._replace(
-            multiplier=solution.multiplier * poison,
-            memory=jax.lax.stop_gradient(solution.memory),
+            multiplier=multiplier * poison,
+            workspace=jax.lax.stop_gradient(solution.workspace),
+            separation=value - self.normals @ velocity,
         )
 
-
-def _solve_linear(problem: ContactProblem, rhs: Array) -> Array:
-    """Return D^-1 rhs for a body without contact pairs."""
-    factor = jax.lax.stop_gradient(problem.factor)
-    return jax.lax.custom_linear_solve(
-        lambda w: problem.matrix @ w, rhs, lambda _, r: factor.solve(r), symmetric=True
-    )
+    def _solve_without_contact(
+        self, rhs: Array, bound: Bound, guess: Guess
+    ) -> tuple[Array, Solution]:
+        """Return D^-1 rhs and the solution of no pairs."""
+        factor = jax.lax.stop_gradient(self.form.factor)
+        velocity = jax.lax.custom_linear_solve(
+            lambda w: self.matrix @ w, rhs, lambda _, r: factor.solve(r), symmetric=True
+        )
+        is_finite = jnp.all(jnp.isfinite(velocity))
+        status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
+        zero = jnp.zeros((), rhs.dtype)
+        nothing = bound.value
+        return velocity, Solution(
+            nothing, guess.active, jnp.int32(0), status, zero, separation=nothing
+        )

@@ -12,7 +12,7 @@ it. They differ at weak contact only. Source: paper, Theorem 4.20 and section 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 from jax import Array
@@ -20,29 +20,45 @@ from jax import Array
 from jaxcontact.contact.complementarity import Solution
 
 
+@runtime_checkable
+class WeakContact(Protocol):
+    """What the derivative of a step means at weak contact: static, hashable, without arrays."""
+
+    is_linear: ClassVar[bool]
+    """Whether the derivative is linear in the direction, so that it has a transpose."""
+
+    def equality_set(self, solution: Solution) -> Array:
+        """Return the pairs on which a linear derivative keeps contact, (C,) bool."""
+        ...
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class Strong:
+class ClosedBranch:
     """Weak contact counts as closed: Algorithm 1 of the paper, and the default.
 
     Exact along directions that press weak pairs together.
     """
 
+    is_linear: ClassVar[bool] = True
+
     def equality_set(self, solution: Solution) -> Array:
-        """Return the pairs on which the derivative keeps contact, (C,) bool."""
+        """Return all pairs with a closed gap, (C,) bool."""
         return solution.active
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class Inactive:
+class OpenBranch:
     """Weak contact counts as open.
 
     Exact along directions that take weak pairs apart.
     """
 
+    is_linear: ClassVar[bool] = True
+
     def equality_set(self, solution: Solution) -> Array:
-        """Return the pairs on which the derivative keeps contact, (C,) bool."""
+        """Return the pairs that are pressed, (C,) bool."""
         return solution.active & (solution.multiplier > 0.0)
 
 
@@ -54,11 +70,11 @@ class CriticalCone:
     `jax.jvp` and `jax.jacfwd` work; `jax.grad` raises a TypeError.
     """
 
+    is_linear: ClassVar[bool] = False
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class OnBranch:
-    """Inside a step whose direction is known: equality where the direction keeps contact."""
+    def equality_set(self, solution: Solution) -> Array:
+        """Return the pairs with a closed gap, (C,) bool: where the cone has constraints."""
+        return solution.active
 
 
 @jax.tree_util.register_dataclass
@@ -75,7 +91,3 @@ class AlongDirection:
 
     initial: Any = None
     """Direction of the initial state, a `State`; None is zero."""
-
-
-#: What a contact problem is told; `AlongDirection` becomes `OnBranch` inside the time loop.
-WeakContact = Strong | Inactive | CriticalCone | OnBranch

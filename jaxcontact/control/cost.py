@@ -35,8 +35,8 @@ class TrackingCost:
         self,
         system: System,
         *,
-        dt: float | Array,
         target: Array,
+        dt: float | Array | None = None,
         control_weight: float | Array = 0.0,
         final_weight: float | Array = 0.0,
         facets: np.ndarray | None = None,
@@ -46,8 +46,8 @@ class TrackingCost:
 
         Args:
             system: the discretised scene.
-            dt: length of a time step tau, [s].
             target: desired displacement y_d, (T+1, N, d) [m].
+            dt: length of a time step tau, [s]; default that of the trajectory.
             control_weight: Tychonoff parameter alpha.
             final_weight: weight gamma of the final-time observation.
             facets: nodes of each facet (F, d), such as `mesh.facets["top"]`: track the trace on
@@ -81,7 +81,8 @@ class TrackingCost:
                 is none.
 
         Raises:
-            ValueError: if the trajectory or the control does not have the T steps of the target.
+            ValueError: if the trajectory or the control does not have the T steps of the target,
+                or dt is not that of the trajectory (under jit the value is NaN instead).
         """
         steps = np.shape(self.target)[0] - 1
         if np.shape(trajectory.displacement) != np.shape(self.target):
@@ -97,7 +98,7 @@ class TrackingCost:
         return _tracking_cost(
             self.nodal_mass,
             self.observation,
-            self.dt,
+            _step_length(trajectory, self.dt),
             self.target,
             self.control_weight,
             self.final_weight,
@@ -144,20 +145,48 @@ def _observation(system: System, facets: Any, nodes: Any) -> Array | None:
     return jnp.zeros(system.n_nodes, system.dtype).at[chosen].set(1.0)
 
 
-def contact_force(trajectory: Trajectory, *, dt: float | Array) -> Array:
-    """Return the sum of all normal contact forces, the mean of each step, (T,) [N]."""
-    return jnp.sum(trajectory.contact_impulse, axis=1) / dt
+def _step_length(trajectory: Trajectory, dt: float | Array | None) -> Array:
+    """Return the dt of the trajectory; NaN if another one was handed over.
+
+    Raises:
+        ValueError: if both are concrete and differ.
+    """
+    own = trajectory.dt
+    if dt is None:
+        return own
+    is_wrong = jnp.abs(dt - own) > 1e-6 * own
+    if isinstance(is_wrong, Tracer):
+        return own * jnp.where(is_wrong, jnp.nan, 1.0)
+    if is_wrong:
+        raise ValueError(
+            f"dt={float(dt):g} is not the step length of the trajectory, {float(own):g}; leave dt "
+            "out, the trajectory knows its own"
+        )
+    return own
+
+
+def contact_force(trajectory: Trajectory, *, dt: float | Array | None = None) -> Array:
+    """Return the sum of all normal contact forces, the mean of each step, (T,) [N].
+
+    Args:
+        trajectory: T steps.
+        dt: not needed; checked against the step length of the trajectory.
+
+    Raises:
+        ValueError: if dt is another one.
+    """
+    return jnp.sum(trajectory.contact_impulse, axis=1) / _step_length(trajectory, dt)
 
 
 def contact_force_error(
-    trajectory: Trajectory, target: float | Array, *, dt: float | Array
+    trajectory: Trajectory, target: float | Array, *, dt: float | Array | None = None
 ) -> Array:
     """Return 1/2 the integral over time of the square of (contact force - target), [N^2 s].
 
     Args:
         trajectory: T steps.
         target: desired sum of the normal contact forces, (T,) or a number for all times [N].
-        dt: length of a time step, [s].
+        dt: see `contact_force`.
 
     Returns:
         A scalar. Its derivative by a control is zero as long as nothing touches; start from a
@@ -171,10 +200,12 @@ def contact_force_error(
         raise ValueError(
             f"the target force must be a number or have shape {force.shape}, got {np.shape(target)}"
         )
-    return 0.5 * dt * jnp.sum((force - target) ** 2)
+    return 0.5 * trajectory.dt * jnp.sum((force - target) ** 2)
 
 
-def contact_time(trajectory: Trajectory, *, dt: float | Array, force_scale: float | Array) -> Array:
+def contact_time(
+    trajectory: Trajectory, *, force_scale: float | Array, dt: float | Array | None = None
+) -> Array:
     """Return the time in contact, tau sum_k F_k / (F_k + F_0), a scalar [s].
 
     A step counts in full where the contact force F_k is large against F_0, and not without
@@ -182,8 +213,8 @@ def contact_time(trajectory: Trajectory, *, dt: float | Array, force_scale: floa
 
     Args:
         trajectory: T steps.
-        dt: length of a time step, [s].
         force_scale: F_0 > 0, a small fraction of the force in contact [N].
+        dt: see `contact_force`.
     """
     force = contact_force(trajectory, dt=dt)
-    return dt * jnp.sum(force / (force + force_scale))
+    return trajectory.dt * jnp.sum(force / (force + force_scale))

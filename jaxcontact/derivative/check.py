@@ -20,20 +20,15 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from jaxcontact.derivative.verdict import Verdict, verdict_of_orders
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.transforms.precision import in_full_precision
 
 #: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
 NOISE = 64.0
 
-#: Orders that count as second order.
-SECOND_ORDER = 1.8
-
 #: Remainders that fall by less than this order over all steps are those of a jump.
 NO_ORDER = 0.5
-
-#: A relative error of J' that rounding may hide before the check is undecided.
-COARSEST = 1e-2
 
 
 @dataclass(frozen=True)
@@ -63,18 +58,20 @@ class GradientCheck:
     """Size below which a remainder is rounding."""
 
     weak_contacts: int | None
-    """Number of (step, pair) in weak contact at u; None if no trajectory was given."""
+    """Number of (step, contact problem, pair) in weak contact at u; None if no trajectory was
+    given."""
 
     contact_changes: int | None
-    """Number of (step, pair) whose contact differs at the largest step; None like above."""
+    """Number of (step, contact problem, pair) whose contact differs at the largest step; None
+    like above."""
 
-    verdict: str
-    """What follows, in words."""
+    verdict: Verdict
+    """What follows."""
 
     @property
     def is_right(self) -> bool:
         """Whether the gradient is the derivative, on both sides and along every direction."""
-        return self.verdict.startswith(("RIGHT", "CONSTANT"))
+        return self.verdict in (Verdict.RIGHT, Verdict.CONSTANT)
 
     @property
     def central_relative_error(self) -> np.ndarray:
@@ -108,6 +105,10 @@ class GradientCheck:
                 f"weak contact on {self.weak_contacts} (step, pair); "
                 f"{self.contact_changes} change within the largest step"
             )
+        if self.verdict is Verdict.RIGHT:
+            lines.append(f"J' d is exact to {np.max(self.resolution):.0e} or better")
+        if self.verdict is Verdict.UNDECIDED:
+            lines.append(f"rounding hides errors of {np.min(self.resolution):.0e} of J' d")
         return "\n".join([*lines, self.verdict])
 
     def _central(self, i: int) -> str:
@@ -188,6 +189,16 @@ def check_gradient(
     resolution = _resolution(remainder, steps, derivative, noise)
     limit = np.maximum(8.0 * noise, np.max(remainder, axis=2) * (steps[-1] / steps[0]) ** NO_ORDER)
     is_jump = np.any(remainder[:, :, -1] > limit)
+    if not np.isfinite(value):
+        verdict = Verdict.VALUE_NOT_FINITE
+    elif not np.all(np.isfinite(slope)):
+        verdict = Verdict.GRADIENT_NOT_FINITE
+    elif is_constant:
+        verdict = Verdict.CONSTANT
+    elif is_jump:
+        verdict = Verdict.JUMP
+    else:
+        verdict = verdict_of_orders(order, resolution, quotients, noise / steps[-1], weak)
     return GradientCheck(
         value=value,
         steps=steps,
@@ -198,12 +209,7 @@ def check_gradient(
         noise=noise,
         weak_contacts=weak,
         contact_changes=changes,
-        verdict=(
-            _not_finite(value, slope)
-            or ("CONSTANT: J does not change, and its gradient is zero" if is_constant else "")
-            or ("JUMP: the objective does not tend to J(u) here: no derivative" if is_jump else "")
-            or _verdict(order, resolution, quotients, noise / steps[-1], weak)
-        ),
+        verdict=verdict,
     )
 
 
@@ -231,57 +237,6 @@ def _order(remainder: np.ndarray, noise: float) -> float:
     return float(np.median(np.log2(usable[:-1] / usable[1:])[-3:]))
 
 
-def _not_finite(value: float, slope: np.ndarray) -> str:
-    if not np.isfinite(value):
-        return "NOT FINITE: the objective is not finite at u; see Trajectory.status"
-    if not np.all(np.isfinite(slope)):
-        return "NOT FINITE: the objective is finite at u, its gradient is not"
-    return ""
-
-
-def _verdict(order, resolution, quotients, noise, weak) -> str:
-    if np.any(np.isnan(order)):
-        return "NOT FINITE: the objective is not finite near u; see Trajectory.status"
-    is_second = order >= SECOND_ORDER
-    best, worst = float(np.min(resolution)), float(np.max(resolution))
-    if np.all(np.isinf(order)) and best > COARSEST:
-        return (
-            f"UNDECIDED: J does not change beyond its rounding, which hides errors of {best:.0e} "
-            "of the derivative; take a larger step, float64, or J without its constant part"
-        )
-    if np.all(is_second):
-        hint = "" if not weak else " (weak contact is present, but does not enter here)"
-        return (
-            "RIGHT: second order on both sides along every direction, so that J' d is exact to "
-            f"{worst:.0e} or better{hint}"
-        )
-    right, left = quotients
-    is_kink = np.abs(right - left) > 1e-3 * np.maximum(np.abs(right), np.abs(left)) + 4.0 * noise
-    wrong = ~is_second.any(axis=1)
-    if np.any(wrong & ~is_kink):
-        return (
-            "WRONG: first order on both sides although the one-sided quotients agree; a gradient "
-            "that misses a dependence looks like this"
-        )
-    if np.any(wrong):
-        return (
-            "KINK: the objective has different one-sided derivatives here, and along some "
-            f"direction the gradient is neither of them; {_where_the_kink_is(weak)}"
-        )
-    return (
-        "ONE-SIDED: the objective has a kink here; the gradient is the exact derivative on one "
-        "side of it"
-    )
-
-
-def _where_the_kink_is(weak: int | None) -> str:
-    if weak is None:
-        return "give trajectory= to see whether a contact is weak"
-    if weak == 0:
-        return "no contact is weak, so the kink is in the cost, or a contact closer than the steps"
-    return "choose weak_contact=AlongDirection(...)"
-
-
 def _order_words(order: float) -> str:
     return "exact" if np.isinf(order) else f"{order:.2f}"
 
@@ -294,5 +249,6 @@ def _count_contacts(trajectory, unravel, flat, longest) -> tuple[int | None, int
     for row in longest:
         for sign in (1.0, -1.0):
             there = trajectory(unravel(flat + sign * row))
-            changes = max(changes, int(np.sum(np.asarray(there.strong) != np.asarray(here.strong))))
-    return int(np.sum(np.asarray(here.weak))), changes
+            changed = np.asarray(there.contact.strong) != np.asarray(here.contact.strong)
+            changes = max(changes, int(np.sum(changed)))
+    return int(np.sum(np.asarray(here.contact.weak))), changes

@@ -21,12 +21,12 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.contact import CriticalCone
-from jaxcontact.contact.branch import tangent_of
 from jaxcontact.motion.checks import raise_if_failed
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.tangents import tangent_of
 
 
 @in_full_precision
@@ -85,10 +85,12 @@ def directional_derivative(
     trajectory, tangent = jax.jvp(motion, primals, tangents)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
+    contact = replace(
+        tangent.contact, active=trajectory.contact.active, weak=trajectory.contact.weak
+    )
     return replace(
         tangent,
-        active=trajectory.active,
-        weak=trajectory.weak,
+        contact=contact,
         iterations=trajectory.iterations,
         status=trajectory.status,
     )

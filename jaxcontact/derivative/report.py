@@ -3,7 +3,7 @@
 The adjoint state p_k = dJ/df_k is the sensitivity by the load of a step, and xi_k = -dJ/dpsi_k that
 by its gap. On strong contact (N p)_i = 0. On weak contact one branch of the derivative keeps the
 pair open (then xi = 0 and (N p)_i is free), the other keeps it closed (then (N p)_i = 0 and xi is
-free), and
+free). Measured by the impulse of the step's contact problem instead of a load,
 
     (N p)_i <= 0  (p in the critical cone)    and    xi_i >= 0  (mu = N^T xi in its polar)
 
@@ -21,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.contact import Inactive, Status, Strong
+from jaxcontact.contact import ClosedBranch, Status, WeakContact
+from jaxcontact.derivative.weak import contact_sizes, margins, sensitivity
 from jaxcontact.motion.checks import raise_if_failed
-from jaxcontact.motion.simulate import StepShift, simulate, simulate_shifted
-from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.simulate import simulate
+from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -52,6 +53,9 @@ class DerivativeReport:
     weak: np.ndarray
     """Step (0 is the first) and mesh node of every weak contact, (W, 2)."""
 
+    problem: np.ndarray
+    """Contact problem of the step that it belongs to, (W,); 1 is the predictor of a scheme."""
+
     nearly_weak: np.ndarray
     """Step and mesh node of contacts that a relative change by `tolerance` makes weak, (V, 2)."""
 
@@ -59,16 +63,16 @@ class DerivativeReport:
     """What counts as nearly weak."""
 
     margin: float
-    """Strict complementarity: smallest over steps and pairs of the larger of gap / largest gap
-    and impulse / largest impulse; zero if and only if there is weak contact."""
+    """Strict complementarity: smallest over steps, contact problems and pairs of the larger of gap
+    and multiplier, each relative to its size in the motion; zero if and only if there is weak
+    contact."""
 
     cone: np.ndarray
-    """(N p)_i of the open branch on the weak contacts, (W,) [1/N times the cost]; zero in the
-    predictor of `ContactStabilized`, which no load reaches."""
+    """(N p)_i of the open branch on the weak contacts, (W,) [cost per N s]."""
 
     polar: np.ndarray
-    """xi_i of the closed branch beyond that of the open one on the weak contacts, (W,) [1/m times
-    the cost]."""
+    """xi_i of the closed branch beyond that of the open one on the weak contacts, (W,) [cost per
+    m]."""
 
     @property
     def is_differentiable(self) -> bool:
@@ -92,9 +96,11 @@ class DerivativeReport:
             f"contact: strict complementarity margin {self.margin:.1e}, {len(self.weak)} weak, "
             f"{len(self.nearly_weak)} nearly weak (below {self.tolerance:.0e})",
         ]
-        for (step, node), cone, polar in zip(self.weak, self.cone, self.polar, strict=True):
+        rows = zip(self.weak, self.problem, self.cone, self.polar, strict=True)
+        for (step, node), problem, cone, polar in rows:
             signs = f"(N p) = {cone:.3e}, xi = {polar:.3e}: {_kind(cone, polar)}"
-            lines.append(f"  step {step}, node {node}: {signs}")
+            where = " of the predictor" if problem else ""
+            lines.append(f"  step {step}, node {node}{where}: {signs}")
         if self.duality_gap > MODES_DIFFER:
             lines.append("WRONG: forward and reverse mode of the cost differ.")
         elif self.is_differentiable:
@@ -133,51 +139,45 @@ def derivative_report(
     """
     trajectory = simulate(stepper, control, steps=steps, initial=initial)
     raise_if_failed(trajectory)
-    system, n_steps = stepper.system, trajectory.status.shape[0]
-    shift = StepShift(
-        jnp.zeros((n_steps, system.size), system.dtype),
-        jnp.zeros((n_steps, system.normals.count), system.dtype),
-    )
+    n_steps = trajectory.status.shape[0]
 
-    def shifted_cost(shift: StepShift, weak_contact) -> Array:
-        return cost(simulate_shifted(stepper, control, initial, shift, weak_contact))
+    def perturbed_cost(
+        perturbation: StepPerturbation, weak_contact: WeakContact | None = None
+    ) -> Array:
+        perturbed = with_perturbation(stepper, perturbation)
+        options = {"steps": n_steps, "initial": initial, "weak_contact": weak_contact}
+        return cost(simulate(perturbed, control, **options))
 
-    closed = jax.grad(shifted_cost)(shift, Strong())
-    opened = jax.grad(shifted_cost)(shift, Inactive())
-    normal_product = jax.vmap(lambda p: system.normals @ p)
-    strong, weak = np.asarray(trajectory.strong), np.asarray(trajectory.weak)
-    in_cone = np.asarray(normal_product(opened.load))
-    on_strong = np.abs(np.asarray(normal_product(closed.load))) * strong
+    closed = sensitivity(perturbed_cost, stepper, n_steps)
+    opened = sensitivity(perturbed_cost, stepper, n_steps, trajectory.contact.weak)
+    normal_product = jax.vmap(lambda p: stepper.system.normals @ p)
+    on_strong = np.abs(np.asarray(normal_product(closed.load))) * np.asarray(trajectory.strong)
     size = float(jnp.max(jnp.abs(closed.load)))
-    margins = _margins(trajectory)
-    nodes = np.asarray(system.contact_nodes)
-    is_near = (margins < tolerance) & ~weak
 
-    direction = jax.random.normal(jax.random.key(seed), shift.load.shape, system.dtype)
-    tangent = StepShift(direction, jnp.zeros_like(shift.gap))
-    _, forward = jax.jvp(lambda s: shifted_cost(s, Strong()), (shift,), (tangent,))
+    direction = jax.random.normal(jax.random.key(seed), closed.load.shape, closed.load.dtype)
+
+    def along(load: Array) -> Array:
+        return perturbed_cost(StepPerturbation(load), ClosedBranch())
+
+    _, forward = jax.jvp(along, (jnp.zeros_like(direction),), (direction,))
     reverse = jnp.vdot(closed.load, direction)
     scale = jnp.linalg.norm(closed.load) * jnp.linalg.norm(direction)
+
+    weak = np.asarray(trajectory.contact.weak)
+    margin = np.where(weak, 0.0, margins(trajectory, contact_sizes(stepper, trajectory)))
+    nodes = np.asarray(stepper.system.contact_nodes)
     return DerivativeReport(
         forward_residual=float(jnp.max(trajectory.residual)),
         worst_status=Status(int(jnp.max(trajectory.status))),
         adjoint_residual=float(np.max(on_strong, initial=0.0)) / (size or 1.0),
         duality_gap=float(jnp.abs(forward - reverse) / jnp.where(scale > 0.0, scale, 1.0)),
         weak=_places(weak, nodes),
-        nearly_weak=_places(is_near, nodes),
+        problem=np.nonzero(weak)[1],
+        nearly_weak=_places((margin < tolerance) & ~weak, nodes),
         tolerance=tolerance,
-        margin=float(np.min(np.where(weak, 0.0, margins), initial=np.inf)),
-        cone=np.where(np.asarray(trajectory.active), in_cone, 0.0)[weak],
+        margin=float(np.min(margin, initial=np.inf)),
+        cone=-np.asarray(opened.push)[weak],
         polar=np.asarray(opened.gap - closed.gap)[weak],
-    )
-
-
-def _margins(trajectory: Trajectory) -> np.ndarray:
-    """Return the larger of relative gap and relative impulse of every step and pair, (T, C)."""
-    gap = np.abs(np.asarray(trajectory.gap[1:]))
-    impulse = np.asarray(trajectory.contact_impulse)
-    return np.maximum(
-        gap / (np.max(gap, initial=0.0) or 1.0), impulse / (np.max(impulse, initial=0.0) or 1.0)
     )
 
 
@@ -189,6 +189,6 @@ def _kind(cone: float, polar: float) -> str:
 
 
 def _places(mask: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return step and mesh node of the marked pairs, (W, 2)."""
-    steps, pairs = np.nonzero(mask)
+    """Return step and mesh node of the marked (step, problem, pair), (W, 2)."""
+    steps, _, pairs = np.nonzero(mask)
     return np.stack([steps, nodes[pairs]], axis=1)

@@ -11,7 +11,7 @@ with D w + N^T p = r. A factor offers one of two ways to it (see `can_condense`)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jax import Array
@@ -115,6 +115,7 @@ def can_condense(factor: Factor) -> TypeIs[CondensingFactor]:
     return factor.compliance is not None
 
 
+@runtime_checkable
 class LinearSolver(Protocol):
     """An option object: static, hashable, without arrays."""
 

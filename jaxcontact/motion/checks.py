@@ -6,11 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
 from jaxcontact.contact import Status
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
+from jaxcontact.schemes.terms import gap_resolution
+from jaxcontact.system.system import System
+from jaxcontact.transforms.traced import is_traced, poison_unless
+
+#: An initial state may reach into an obstacle by so many rounding errors of the gap: a state that
+#: another run ended with does.
+PENETRATION = 64.0
 
 
 class SolveError(RuntimeError):
@@ -42,7 +48,10 @@ def check_steps(stepper: Stepper, control: Array | None, steps: int | None) -> i
 
 
 def check_initial(stepper: Stepper, initial: State | None) -> State:
-    """Return the initial state; None is at rest."""
+    """Return the initial state; None is at rest.
+
+    A traced state that cannot be one, or one in a traced scene, is NaN instead of an error.
+    """
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
     if initial is None:
@@ -55,67 +64,73 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
                 f"initial.{name} must have shape (N, d) = {shape}, got {np.shape(value)}"
             )
         _check_finite(f"initial.{name}", value)
-        _check_clamped(system, name, value)
-    _check_penetration(system, initial.displacement)
-    return State(
+    state = State(
         jnp.asarray(initial.displacement, system.dtype), jnp.asarray(initial.velocity, system.dtype)
     )
+    if is_traced((system, state)):
+        is_held = jnp.stack(
+            [~jnp.any(_moved(system, x)) for x in (state.displacement, state.velocity)]
+        )
+        is_outside = jnp.all(_penetration(system, state.displacement) <= 0.0)
+        return poison_unless(jax.lax.stop_gradient(jnp.all(is_held) & is_outside), state)
+    # Concrete values stay concrete, also where the caller is under jit.
+    with jax.ensure_compile_time_eval():
+        for name in ("displacement", "velocity"):
+            moved = np.flatnonzero(_moved(system, getattr(state, name)))
+            if moved.size:
+                raise ValueError(
+                    f"initial.{name} is not zero on {moved.size} clamped nodes, first "
+                    f"{moved[:5].tolist()}"
+                )
+        depth = np.asarray(_penetration(system, state.displacement))
+    if np.any(depth > 0.0):
+        deepest = int(np.argmax(depth))
+        raise ValueError(
+            f"the initial state penetrates the obstacle at {np.count_nonzero(depth > 0.0)} contact "
+            f"nodes, deepest at node {int(system.contact_nodes[deepest])} by {depth[deepest]:.3g} "
+            "m; move the obstacle or give an initial displacement with an open gap"
+        )
+    return state
 
 
-def _is_concrete(*values) -> bool:
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+def _moved(system: System, values: Array) -> Array:
+    """Return the clamped nodes where a nodal field (N, d) is not zero, (N,) bool."""
+    is_clamped = system.node_numbers == len(system.free_nodes)
+    return is_clamped & jnp.any(values != 0.0, axis=1)
+
+
+def _penetration(system: System, displacement: Array) -> Array:
+    """Return the depth of each pair in the obstacle, (C,) [m]; zero up to rounding."""
+    y = system.restrict(displacement)
+    gap = system.gap - system.normals @ y
+    return jnp.where(gap < -PENETRATION * gap_resolution(system, y), -gap, 0.0)
 
 
 def _check_finite(name: str, value: Array) -> None:
-    if _is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
+    if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
         bad = np.argwhere(~np.isfinite(np.asarray(value)))
         raise ValueError(
             f"{name} holds {len(bad)} values that are not finite, first at {tuple(bad[0].tolist())}"
         )
 
 
-def _check_clamped(system, name: str, value: Array) -> None:
-    if not _is_concrete(value, system.node_numbers):
-        return
-    is_clamped = np.asarray(system.node_numbers) == len(system.free_nodes)
-    moved = np.flatnonzero(is_clamped & np.any(np.asarray(value) != 0.0, axis=1))
-    if moved.size:
-        raise ValueError(
-            f"initial.{name} is not zero on {moved.size} clamped nodes, first {moved[:5].tolist()}"
-        )
-
-
-def _check_penetration(system, displacement: Array) -> None:
-    if not _is_concrete(system, displacement):
-        return
-    # Concrete values stay concrete, also where the caller is under jit.
-    with jax.ensure_compile_time_eval():
-        y = system.restrict(jnp.asarray(displacement, system.dtype))
-        gap = np.asarray(system.gap - system.normals @ y)
-    size = np.max(np.abs(np.asarray(system.gap)), initial=0.0) + np.max(np.abs(np.asarray(y)))
-    deepest = int(np.argmin(gap)) if gap.size else 0
-    if gap.size and gap[deepest] < -64 * np.finfo(gap.dtype).eps * size:
-        count = np.count_nonzero(gap < 0.0)
-        raise ValueError(
-            f"the initial state penetrates the obstacle at {count} contact nodes, deepest at node "
-            f"{int(system.contact_nodes[deepest])} by {-gap[deepest]:.3g} m; move the obstacle or "
-            "give an initial displacement with an open gap"
-        )
-
-
 def raise_if_failed(trajectory: Trajectory) -> None:
-    """Raise a `SolveError` if a step of a concrete trajectory was not solved."""
+    """Raise a `SolveError` if a step of a trajectory with a concrete status was not solved."""
     status = np.asarray(trajectory.status)
     failed = np.flatnonzero(status > Status.FALLBACK)
     if not failed.size:
         return
     step = int(failed[0])
-    time = float(trajectory.time[-1]) * (step + 1) / status.size
     reason = Status(int(status[step])).name.lower().replace("_", " ")
+    details = [f"step {step + 1} of {status.size}"]
+    # Under grad the status is concrete, but what can be differentiated is not.
+    if not is_traced(trajectory.dt):
+        details.append(f"(time {(step + 1) * float(trajectory.dt):.6g} s)")
+    details.append(f"ended as {reason} after {int(trajectory.iterations[step])} iterations of the")
+    details.append("contact solver")
+    if not is_traced(trajectory.residual):
+        details.append(f"with a relative KKT residual of {float(trajectory.residual[step]):.2e}")
     raise SolveError(
-        f"step {step + 1} of {status.size} (time {time:.6g} s) ended "
-        f"as {reason} after {int(trajectory.iterations[step])} iterations of the contact solver, "
-        f"relative KKT residual {float(trajectory.residual[step]):.2e}; "
-        "reduce dt, check the loads for overflow, or allow more steps, for instance "
-        "contact_solver=jc.SemismoothNewton(max_steps=100)"
+        " ".join(details) + "; reduce dt, check the loads for overflow, or allow more steps, for "
+        "instance contact_solver=jc.SemismoothNewton(max_steps=100)"
     )

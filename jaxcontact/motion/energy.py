@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import Guess
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.schemes import StepState
+from jaxcontact.schemes import Losses, StepState
+from jaxcontact.schemes.terms import viscous_loss
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -72,7 +72,7 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     Returns:
         Energies and flows; the identity of the module docstring holds to rounding.
     """
-    system, operators = stepper.system, stepper.operators
+    system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
     def nothing_yet(record: Array) -> Array:
         return jnp.concatenate([jnp.zeros_like(record[:1]), record])
@@ -81,7 +81,7 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         displacement=system.restrict(trajectory.displacement),
         velocity=system.restrict(trajectory.velocity),
         impulse=nothing_yet(trajectory.contact_impulse),
-        guess=Guess(nothing_yet(trajectory.active)),
+        guesses=(),
     )
 
     def measure(state: StepState) -> tuple[Array, Array]:
@@ -89,28 +89,31 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         elastic = 0.5 * jnp.dot(state.displacement, system.stiffness @ state.displacement)
         return kinetic, elastic
 
-    def flow(old: StepState, new: StepState, force: Array | None):
+    def flow(
+        old: StepState, new: StepState, force: Array | None
+    ) -> tuple[Array, Array, Array, Losses]:
         load = system.load if force is None else system.load + system.control_load(force)
         velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
+        increment = new.displacement - old.displacement
         change = 0.5 * (
             jnp.dot(new.velocity - old.velocity, operators.mass @ velocity)
-            + jnp.dot(new.displacement - old.displacement, system.stiffness @ displacement)
+            + jnp.dot(increment, system.stiffness @ displacement)
         )
-        return change, stepper.scheme.energy_flow(system, operators, stepper.dt, old, new, load)
+        losses = stepper.scheme.losses(system, operators, dt, old, new)
+        return change, jnp.dot(increment, load), viscous_loss(system, dt, increment), losses
 
     kinetic, elastic = jax.lax.map(measure, states)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
-    change, flows = jax.lax.map(lambda step: flow(*step), (old, new, control))
-    numerical_loss = jnp.asarray(flows.numerical_loss, change.dtype)
-    loss = flows.viscous_loss + flows.impact_loss + numerical_loss
+    change, work, viscous, losses = jax.lax.map(lambda step: flow(*step), (old, new, control))
+    numerical = jnp.asarray(losses.numerical, change.dtype)
     return Energy(
         kinetic=kinetic,
         elastic=elastic,
         change=change,
-        work=flows.work,
-        viscous_loss=flows.viscous_loss,
-        impact_loss=flows.impact_loss,
-        numerical_loss=numerical_loss,
-        residual=change - (flows.work - loss),
+        work=work,
+        viscous_loss=viscous,
+        impact_loss=losses.impact,
+        numerical_loss=numerical,
+        residual=change - (work - (viscous + losses.impact + numerical)),
     )

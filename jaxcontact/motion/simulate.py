@@ -1,32 +1,26 @@
-"""The time loop: one contact problem per step, scanned."""
+"""The time loop: one step of the scheme after the other, scanned."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import AlongDirection, WeakContact
-from jaxcontact.contact.branch import (
-    along_direction,
-    check_weak_contact,
-    float_leaves,
-    forward_mode_advice,
-    tangent_of,
-    with_weak_contact,
-)
-from jaxcontact.contact.probe import at_step
+from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
 from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed
-from jaxcontact.motion.stepper import Stepper
-from jaxcontact.motion.trajectory import State, Trajectory
+from jaxcontact.motion.stepper import Stepper, StepPerturbation
+from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
-from jaxcontact.system.system import System
+from jaxcontact.schemes.interface import first_state
+from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.tangents import tangent_of
 from jaxcontact.transforms.time_loop import Checkpoint, scan_steps
 
 
@@ -55,15 +49,15 @@ def simulate(
         checkpoint: `Checkpoint(segments)` lets the backward pass recompute the steps of a segment
             instead of storing them; same gradient to rounding, about one more forward run.
         weak_contact: what the derivative means where gap and impulse of a pair are both zero:
-            `Strong()` (default, Algorithm 1), `Inactive()`, `AlongDirection(control)`, or
+            `ClosedBranch()` (default, Algorithm 1), `OpenBranch()`, `AlongDirection(control)`, or
             `CriticalCone()`, the exact one-sided derivative, in forward mode.
 
     Returns:
         The trajectory of T steps.
 
     Raises:
-        ValueError: if shapes do not fit, a value is not finite, or the initial state penetrates
-            an obstacle or moves a clamped node.
+        ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
+            finite, or the initial state penetrates an obstacle or moves a clamped node.
         SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
             the trajectory is NaN from that step on instead.
 
@@ -72,121 +66,135 @@ def simulate(
     a `jax.custom_vjp`); at weak contact the derivative that it names.
     """
     steps = check_steps(stepper, control, steps)
-    if save_every < 1 or steps % save_every:
+    if isinstance(save_every, bool) or save_every < 1 or steps % save_every:
         raise ValueError(
             f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
         )
+    if checkpoint is not None:
+        check_option("checkpoint", checkpoint, Checkpoint, "Checkpoint()")
+    if weak_contact is not None:
+        kinds = (WeakContact, AlongDirection)
+        check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
     initial = check_initial(stepper, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
-    check_weak_contact(weak_contact)
-    with forward_mode_advice():
+    if isinstance(weak_contact, AlongDirection):
+        stepper = _open_along(stepper, control, initial, steps, weak_contact)
+        weak_contact = ClosedBranch()
+    with _forward_mode_advice():
         trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
 
 
-class StepShift(NamedTuple):
-    """A perturbation of the data of every step; zero, to be differentiated by."""
-
-    load: Array
-    """Added to the load, (T, n) [N]."""
-
-    gap: Array
-    """Added to the gap psi in the contact problem of the step, (T, C) [m]."""
-
-
-def simulate_shifted(
-    stepper: Stepper,
-    control: Array | None,
-    initial: State | None,
-    shift: StepShift,
-    weak_contact: WeakContact | AlongDirection,
-) -> Trajectory:
-    """Simulate with perturbed loads and gaps: their derivative are the adjoint states."""
-    initial = check_initial(stepper, initial)
-    steps = shift.load.shape[0]
-    return _run(stepper, control, initial, weak_contact, steps, 1, None, shift)
-
-
 @in_full_precision
-@partial(jax.jit, static_argnames=("steps", "save_every", "checkpoint"))
+@partial(jax.jit, static_argnames=("weak_contact", "steps", "save_every", "checkpoint"))
 def _run(
     stepper: Stepper,
     control: Array | None,
     initial: State,
-    weak_contact: Any,
+    weak_contact: WeakContact | None,
     steps: int,
     save_every: int,
     checkpoint: Checkpoint | None,
-    shift: StepShift | None = None,
 ) -> Trajectory:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
-    if weak_contact is not None:
-        operators = with_weak_contact(operators, weak_contact)
-    start = StepState(
-        displacement=system.restrict(initial.displacement),
-        velocity=system.restrict(initial.velocity),
-        impulse=jnp.zeros(system.normals.count, system.dtype),
-        guess=operators.problem.first_guess(),
-        memory=stepper.scheme.memory(system, operators),
+    operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
+    start = first_state(
+        stepper.scheme,
+        system,
+        operators,
+        system.restrict(initial.displacement),
+        system.restrict(initial.velocity),
     )
 
-    def advance(state: StepState, inputs: tuple[Array | None, Array, StepShift | None]):
-        force, step, shift = inputs
-        now = system if shift is None else replace(system, gap=system.gap + shift.gap)
+    def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation]):
+        force, perturbation = inputs
         load = system.load if force is None else system.load + system.control_load(force)
-        load = load if shift is None else load + shift.load
-        state, info = stepper.scheme.step(now, at_step(operators, step), dt, state, load)
-        return state, (state.impulse, state.guess.active, info)
+        load = load if perturbation.load is None else load + perturbation.load
+        perturbed = perturbation.on(operators, dt)
+        result = stepper.scheme.step(system, perturbed, dt, state, load)
+        return result.state(), (
+            result.impulse,
+            _worst(result.solutions),
+            _record(dt, result.solutions),
+        )
 
-    inputs = (control, jnp.arange(steps), shift)
-    if isinstance(weak_contact, AlongDirection):
-        start_dot, control_dot = _direction(system, start, control, weak_contact)
-        (states, _), (impulse, active, info) = scan_steps(
-            along_direction(advance),
-            (start, start_dot),
-            (inputs, control_dot),
-            steps,
-            save_every,
-            checkpoint,
-        )
-    else:
-        states, (impulse, active, info) = scan_steps(
-            advance, start, inputs, steps, save_every, checkpoint
-        )
+    inputs = (control, stepper.perturbation)
+    states, (impulse, (iterations, status, residual), contact) = scan_steps(
+        advance, start, inputs, steps, save_every, checkpoint
+    )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
     velocity = jnp.concatenate([start.velocity[None], states.velocity])
     normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
     return Trajectory(
+        dt=dt,
         time=dt * jnp.arange(0, steps + 1, save_every),
         displacement=system.lift(displacement),
         velocity=system.lift(velocity),
         gap=system.gap[None, :] - normal_displacement,
         contact_impulse=impulse,
-        active=active,
-        iterations=info.iterations,
-        status=info.status,
-        residual=info.residual,
-        weak=info.weak,
+        contact=contact,
+        iterations=iterations,
+        status=status,
+        residual=residual,
     )
 
 
-def _direction(
-    system: System, start: StepState, control: Array | None, along: AlongDirection
-) -> tuple[list, Array | None]:
-    """Return the tangents of the start and of the control that decide about weak contact."""
-    start_dot = tangent_of(start, None)
-    if along.initial is not None:
-        start_dot = start_dot._replace(
-            displacement=system.restrict(along.initial.displacement),
-            velocity=system.restrict(along.initial.velocity),
-        )
-    control_dot = along.control
-    if control_dot is not None and control is None:
+def _record(dt: Array, solutions: tuple[Solution, ...]) -> ContactRecord:
+    """Return how the contact problems of one step ended, (P, C) each."""
+    return ContactRecord(
+        multiplier=jnp.stack([x.multiplier for x in solutions]),
+        gap=dt * jnp.stack([x.separation for x in solutions]),
+        active=jnp.stack([x.active for x in solutions]),
+        weak=jnp.stack([x.weak for x in solutions]),
+    )
+
+
+def _worst(solutions: tuple[Solution, ...]) -> tuple[Array, Array, Array]:
+    """Return most iterations, worst status and largest residual of the problems of a step."""
+    return (
+        jnp.max(jnp.stack([x.iterations for x in solutions])),
+        jnp.max(jnp.stack([x.status for x in solutions])),
+        jnp.max(jnp.stack([x.residual for x in solutions])),
+    )
+
+
+def _open_along(
+    stepper: Stepper, control: Array | None, initial: State, steps: int, along: AlongDirection
+) -> Stepper:
+    """Return a stepper in whose derivative those weak pairs are open that a direction opens."""
+    if along.control is not None and control is None:
         raise ValueError("AlongDirection(control) needs a control; give a control of zeros")
-    if control_dot is None and control is not None:
-        control_dot = jnp.zeros_like(control)
-    return jax.lax.stop_gradient((float_leaves(start, start_dot), control_dot))
+    # What the direction decides is constant for the gradient.
+    primals, directions = jax.lax.stop_gradient(
+        ((stepper, control, initial), (None, along.control, along.initial))
+    )
+    tangents = tuple(tangent_of(x, dx) for x, dx in zip(primals, directions, strict=True))
+
+    def contact(stepper: Stepper, control: Array | None, initial: State) -> ContactRecord:
+        return _run(stepper, control, initial, CriticalCone(), steps, 1, None).contact
+
+    record, tangent = jax.jvp(contact, primals, tangents)
+    is_open = record.weak & ~(tangent.multiplier > 0.0)
+    if stepper.perturbation.is_open is not None:
+        is_open = is_open | stepper.perturbation.is_open
+    return replace(stepper, perturbation=stepper.perturbation._replace(is_open=is_open))
+
+
+@contextmanager
+def _forward_mode_advice() -> Iterator[None]:
+    """Say how forward mode is had where JAX only says that a custom_vjp has none."""
+    try:
+        yield
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise TypeError(
+            "simulate has reverse mode only, as jax.grad uses it, unless weak_contact names what "
+            "forward mode means at weak contact: simulate(..., weak_contact=jc.ClosedBranch()), "
+            "the derivative that jax.grad takes, or jc.CriticalCone(), the exact one-sided one; "
+            "see also jc.directional_derivative"
+        ) from error

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton, Solution, Status
-from jaxcontact.linear import LinearSolver, check_memory, choose_linear_solver
+from jaxcontact.contact import Bound, ContactProblem, ContactSolver, Solution, Status
+from jaxcontact.linear import LinearSolver
 from jaxcontact.motion.checks import SolveError
-from jaxcontact.motion.stepper import unknown_coordinates
+from jaxcontact.motion.stepper import choose_solvers, factorize
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
@@ -69,7 +69,8 @@ def solve_static(
         The equilibrium.
 
     Raises:
-        ValueError: if no node is clamped or the stiffness matrix is not positive definite.
+        ValueError: if no node is clamped, an option is not an object of its kind, the solvers do
+            not fit each other, or the stiffness matrix is not positive definite.
         SolveError: if the result is concrete and was not solved; under jit or grad it is NaN.
 
     Derivative: reverse mode by every value of the system, on the active set.
@@ -79,14 +80,8 @@ def solve_static(
             "no node is clamped, so the body can move rigidly and has no unique equilibrium; clamp "
             "a facet set, or let jc.simulate with jc.BackwardEuler() come to rest"
         )
-    solver = SemismoothNewton() if contact_solver is None else contact_solver
-    shape = (system.size, system.dimension, system.dtype.itemsize)
-    if linear_solver is None:
-        linear_solver = choose_linear_solver(*shape, is_dense=system.basis is not None)
-    check_memory(linear_solver, *shape)
-    matrix, normals = jax.lax.stop_gradient((system.stiffness, system.normals))
-    factor = linear_solver.factorize(matrix, normals, unknown_coordinates(system))
-    problem = ContactProblem(system.stiffness, system.normals, factor, solver)
+    solvers = choose_solvers(system, linear_solver, contact_solver)
+    problem = factorize(system, system.stiffness, *solvers)
     y, solution = _solve(system, problem)
     _check(solution.status)
     return StaticContact(
@@ -104,9 +99,8 @@ def _solve(system: System, problem: ContactProblem) -> tuple[Array, Solution]:
     """Return the unknowns (n,) of the equilibrium and the solution on the contact pairs."""
     return problem.solve(
         system.load,
-        bound=system.gap,
-        resolution=gap_resolution(system, jnp.zeros_like(system.load)),
-        guess=problem.first_guess()._replace(active=system.gap < 0.0),
+        Bound(system.gap, gap_resolution(system, jnp.zeros_like(system.load))),
+        problem.form.first_guess()._replace(active=system.gap < 0.0),
     )
 
 

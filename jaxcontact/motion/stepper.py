@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,58 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import ContactProblem, ContactSolver, SemismoothNewton
+from jaxcontact.contact import (
+    ContactProblem,
+    ContactSolver,
+    Perturbation,
+    SemismoothNewton,
+    contact_form,
+)
 from jaxcontact.linear import Factor, LinearSolver, check_memory, choose_linear_solver
-from jaxcontact.schemes import ContactImplicit, Scheme
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.schemes import ContactImplicit, Operators, Scheme
+from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
+from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.trees import exchange
+
+Tree = TypeVar("Tree")
+
+
+class StepPerturbation(NamedTuple):
+    """A change of the data of every step, zero but to be differentiated by; None is no change.
+
+    T steps, P contact problems of a step (see `Operators.problems`), C contact pairs.
+    """
+
+    load: Array | None = None
+    """Added to the load, (T, n) [N]."""
+
+    gap: Array | None = None
+    """Added to the gap psi, (T, P, C) [m]."""
+
+    push: Array | None = None
+    """Impulses that push the body away from the obstacle, (T, P, C) [N s]; see `Perturbation`."""
+
+    is_open: Array | None = None
+    """Pairs that are open in the derivative, whatever their state, (T, P, C) bool."""
+
+    def on(self, operators: Operators, dt: Array) -> Operators:
+        """Return the perturbed operators of one step, whose part of the perturbation this is."""
+        if self.gap is None and self.push is None and self.is_open is None:
+            return operators
+
+        def change(number: int, problem: ContactProblem) -> ContactProblem:
+            gap, push, is_open = (
+                None if x is None else x[number] for x in (self.gap, self.push, self.is_open)
+            )
+            bound = None if gap is None else gap / dt
+            return replace(problem, perturbation=Perturbation(bound, push, is_open))
+
+        return operators.changed(change)
+
+
+NO_PERTURBATION = StepPerturbation()
 
 
 @jax.tree_util.register_dataclass
@@ -30,17 +76,22 @@ class Stepper:
     dt: Array
     """Length of a time step tau, scalar [s]."""
 
-    operators: Any
-    """Operators of the scheme, with the factor of its matrix."""
+    operators: Operators
+    """What a step works with: the factors of the scheme's matrices and the contact solver."""
 
     scheme: Scheme = field(metadata={"static": True})
     """The time-stepping scheme."""
 
     linear_solver: LinearSolver = field(metadata={"static": True})
-    """How the matrix was factorised."""
+    """How the matrices were factorised."""
 
-    contact_solver: ContactSolver
-    """How the contact problem of a step is solved."""
+    perturbation: StepPerturbation = NO_PERTURBATION
+    """What every step is perturbed by, for certificates of the derivative."""
+
+    @property
+    def contact_solver(self) -> ContactSolver:
+        """How the contact problem of a step is solved."""
+        return self.operators.problem.contact_solver
 
     def __repr__(self) -> str:
         """Return the choices that were made, without arrays."""
@@ -49,14 +100,6 @@ class Stepper:
             f"scheme={self.scheme}, linear_solver={self.linear_solver}, "
             f"contact_solver={self.contact_solver})"
         )
-
-
-#: What to write where a name was given for an option.
-EXAMPLES = {
-    "scheme": "ContactImplicit",
-    "linear_solver": "NestedDissection",
-    "contact_solver": "SemismoothNewton",
-}
 
 
 @in_full_precision
@@ -84,48 +127,102 @@ def prepare(
         The stepper.
 
     Raises:
-        ValueError: if dt is not positive, an option is a class instead of an object, the patterns
-            are traced, a factor would not fit in memory, or a matrix is not positive definite.
+        ValueError: if dt is not positive, an option is not an object of its kind, the solvers do
+            not fit each other, the patterns are traced, a factor would not fit in memory, or a
+            matrix is not positive definite.
     """
     scheme = ContactImplicit() if scheme is None else scheme
-    contact_solver = SemismoothNewton() if contact_solver is None else contact_solver
+    check_option("scheme", scheme, Scheme, "ContactImplicit()")
+    is_number = not isinstance(dt, bool) and np.shape(dt) == ()
+    if not isinstance(dt, Tracer) and not (is_number and np.isfinite(dt) and np.asarray(dt) > 0.0):
+        raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+    linear_solver, contact_solver = choose_solvers(system, linear_solver, contact_solver)
+    dt = jnp.asarray(dt, system.dtype)
+    mass, matrices = scheme.matrices(system, dt)
+    problems = tuple(factorize(system, x, linear_solver, contact_solver) for x in matrices)
+    return Stepper(system, dt, Operators(mass, problems), scheme, linear_solver)
+
+
+def choose_solvers(
+    system: System, linear_solver: LinearSolver | None, contact_solver: ContactSolver | None
+) -> tuple[LinearSolver, ContactSolver]:
+    """Return the solvers for a system, checked; None is the default.
+
+    Raises:
+        ValueError: if an option is not an object of its kind, the pattern of the system is traced,
+            or a factor would not fit in memory.
+    """
     shape = (system.size, system.dimension, system.dtype.itemsize)
     if linear_solver is None:
         linear_solver = choose_linear_solver(*shape, is_dense=system.basis is not None)
-    for name, option in (
-        ("scheme", scheme),
-        ("linear_solver", linear_solver),
-        ("contact_solver", contact_solver),
-    ):
-        if isinstance(option, type | str):
-            example = option.__name__ if isinstance(option, type) else EXAMPLES[name]
-            raise ValueError(f"{name} must be an object, such as jc.{example}(), got {option!r}")
-    if not isinstance(dt, Tracer) and not (np.isfinite(dt) and np.asarray(dt) > 0.0):
-        raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+    if contact_solver is None:
+        contact_solver = SemismoothNewton()
+    check_option("linear_solver", linear_solver, LinearSolver, "NestedDissection()")
+    check_option("contact_solver", contact_solver, ContactSolver, "SemismoothNewton()")
     if isinstance(system.stiffness.columns, Tracer):
         raise ValueError(
             "the sparsity pattern of the system is traced; call prepare outside jax.jit, or build "
             "mesh and scene inside the transformed function so that only values are traced"
         )
     check_memory(linear_solver, *shape)
-    dt = jnp.asarray(dt, system.dtype)
-    coordinates = unknown_coordinates(system)
-
-    def make_problem(matrix: SymmetricMatrix) -> ContactProblem:
-        frozen = jax.lax.stop_gradient((matrix.values, system.normals.weights))
-        factor = linear_solver.factorize(
-            SymmetricMatrix(frozen[0], matrix.columns),
-            type(system.normals)(frozen[1], system.normals.unknowns),
-            coordinates,
-        )
-        _check_factor(factor)
-        return ContactProblem(matrix, system.normals, factor, contact_solver)
-
-    operators = scheme.prepare(system, dt, make_problem)
-    return Stepper(system, dt, operators, scheme, linear_solver, contact_solver)
+    return linear_solver, contact_solver
 
 
-def unknown_coordinates(system: System) -> np.ndarray | None:
+def factorize(
+    system: System,
+    matrix: SymmetricMatrix,
+    linear_solver: LinearSolver,
+    contact_solver: ContactSolver,
+) -> ContactProblem:
+    """Return the contact problem of an SPD matrix with the contact normals of a system.
+
+    Raises:
+        ValueError: if the matrix is concrete and not positive definite, or the solvers do not fit
+            each other.
+    """
+    frozen = jax.lax.stop_gradient((matrix.values, system.normals.weights))
+    factor = linear_solver.factorize(
+        SymmetricMatrix(frozen[0], matrix.columns),
+        ContactNormals(frozen[1], system.normals.unknowns),
+        _unknown_coordinates(system),
+    )
+    _check_factor(factor)
+    return ContactProblem(matrix, system.normals, contact_form(factor, contact_solver))
+
+
+def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:
+    """Return a pytree in which every stepper solves contact by another contact solver.
+
+    Args:
+        tree: a stepper, or anything that holds one: an objective given as `jax.tree_util.Partial`
+            of a function and a stepper, a problem such as `scenes.half_disc_control`.
+        contact_solver: the solver to put in.
+
+    Raises:
+        ValueError: if the tree holds no stepper, the solver is not an object, or a stepper was
+            prepared with a linear solver that it cannot work with.
+    """
+    check_option("contact_solver", contact_solver, ContactSolver, "SemismoothNewton()")
+
+    def change(number: int, problem: ContactProblem) -> ContactProblem:
+        del number
+        return replace(problem, form=contact_form(problem.form.factor, contact_solver))
+
+    return exchange(
+        tree, Stepper, lambda stepper: replace(stepper, operators=stepper.operators.changed(change))
+    )
+
+
+def with_perturbation(tree: Tree, perturbation: StepPerturbation) -> Tree:
+    """Return a pytree in which every stepper is perturbed; see `StepPerturbation`.
+
+    Raises:
+        ValueError: if the tree holds no stepper.
+    """
+    return exchange(tree, Stepper, lambda stepper: replace(stepper, perturbation=perturbation))
+
+
+def _unknown_coordinates(system: System) -> np.ndarray | None:
     """Return the positions of the unknowns, (n, d), if they are concrete and have any."""
     if isinstance(system.points, Tracer) or system.basis is not None:
         return None
@@ -133,7 +230,7 @@ def unknown_coordinates(system: System) -> np.ndarray | None:
 
 
 def _check_factor(factor: Factor) -> None:
-    """Check a concrete factor by what it says of itself."""
+    """Raise a ValueError if a concrete factor is not that of a positive definite matrix."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(factor)):
         return
     if not factor.is_positive:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 
@@ -22,8 +23,42 @@ class State:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class ContactRecord:
+    """How every contact problem of every step ended; T steps, P problems of a step, C pairs.
+
+    Problem 0 is the contact at the end of the step. `ContactStabilized` has two problems: its
+    predictor may be in weak contact while the pair is open at the end of the step.
+    """
+
+    multiplier: Array
+    """Multiplier p of the VI, (T, P, C) [N s]; lam / 2 in the contact-implicit scheme."""
+
+    gap: Array
+    """Gap that the problem leaves, (T, P, C) [m]."""
+
+    active: Array
+    """Pairs with a closed gap, (T, P, C) bool: strong and weak contact."""
+
+    weak: Array
+    """Pairs in weak contact, (T, P, C) bool: closed without a force.
+
+    Gap and force count as zero below the rounding of the problem, `complementarity.tolerance` in
+    the folder contact.
+    """
+
+    @property
+    def strong(self) -> Array:
+        """Pairs in strong contact, (T, P, C) bool: closed under a force."""
+        return self.active & ~self.weak
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Trajectory:
     """The motion of a body over T steps; N nodes, C contact pairs, dimension d."""
+
+    dt: Array
+    """Length of a time step, scalar [s]."""
 
     time: Array
     """Time levels, (T+1,) [s]."""
@@ -40,27 +75,37 @@ class Trajectory:
     contact_impulse: Array
     """Contact impulse lam of each step, (T, C) [N s]; lam / dt is the mean contact force."""
 
-    active: Array
-    """Pairs with a closed gap at the end of the step, (T, C) bool: strong and weak contact."""
+    contact: ContactRecord
+    """How the contact problems of each step ended."""
 
     iterations: Array
-    """Iterations of the contact solver, (T,) int32."""
+    """Iterations of the contact solver, (T,) int32; the most of a contact problem of the step."""
 
     status: Array
-    """`Status` of each step, (T,) int32."""
+    """`Status` of each step, (T,) int32; the worst of its contact problems."""
 
     residual: Array
     """KKT residual of each step relative to the largest violation of its free motion, (T,)."""
 
-    weak: Array
-    """Pairs in weak contact, closed without a force, in a contact problem of the step, (T, C) bool.
+    @property
+    def contact_force(self) -> Array:
+        """Contact force of each step, (T, C) [N]: impulse / dt; see `contact_pressure`."""
+        return self.contact_impulse / self.dt[..., None, None]
 
-    There the motion has one-sided derivatives only. Gap and force count as zero below the rounding
-    of the step's contact problem (`contact.complementarity.tolerance`). `derivative_report` lists
-    what is nearly weak. `ContactStabilized` has two contact problems: its predictor may be in weak
-    contact while the pair is open at the end of the step. `Trapezoidal` records the mean impulse of
-    two times, but it is the force at the new time that decides here.
-    """
+    @property
+    def active(self) -> Array:
+        """Pairs with a closed gap at the end of the step, (T, C) bool."""
+        return self.contact.active[..., 0, :]
+
+    @property
+    def weak(self) -> Array:
+        """Pairs in weak contact in a contact problem of the step, (T, C) bool.
+
+        There the motion has one-sided derivatives only; `derivative_report` lists what is nearly
+        weak. `Trapezoidal` records the mean impulse of two times, but it is the force at the new
+        time that decides here.
+        """
+        return jnp.any(self.contact.weak, axis=-2)
 
     @property
     def strong(self) -> Array:

@@ -26,10 +26,10 @@ import scipy.optimize
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxcontact.contact.probe import with_probe
 from jaxcontact.control.bounds import free_variables, mask
 from jaxcontact.control.problem import Problem
-from jaxcontact.motion.stepper import Stepper
+from jaxcontact.derivative.weak import contact_sizes, margins
+from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
 from jaxcontact.motion.trajectory import Trajectory
 
 #: Multipliers above minus this times the largest one count as not negative.
@@ -52,6 +52,10 @@ class Stationarity:
 
     weak_pairs: np.ndarray
     """Step k (0 is the first) and number of the pair of each weak contact, (m, 2) int."""
+
+    contact_problem: np.ndarray
+    """Contact problem of the step that each weak contact belongs to, (m,) int; 1 is the predictor
+    of a scheme that has one."""
 
     gap_multiplier: np.ndarray
     """nu, (m,) [1/m]: what the cost would gain per length if the pair could penetrate."""
@@ -96,15 +100,15 @@ def certify(
         ValueError: if the motion does not record every step or has too many weak pairs.
     """
     trajectory = _run(motion, problem.controls, parameters)
-    gap, impulse = np.asarray(trajectory.gap[1:]), np.asarray(trajectory.contact_impulse)
-    if gap.shape != impulse.shape:
+    gap, impulse = (np.asarray(x) for x in (trajectory.contact.gap, trajectory.contact.multiplier))
+    if trajectory.gap.shape[0] != gap.shape[0] + 1:
         raise ValueError("the motion must record every step; simulate it with save_every=1")
-    sizes = np.max(trajectory.gap, initial=0.0), _impulse_size(motion, trajectory)
-    is_weak = (gap <= tolerance * sizes[0]) & (impulse <= tolerance * sizes[1])
-    pairs = np.argwhere(is_weak)
-    if len(pairs) > MAX_PAIRS:
+    sizes = contact_sizes(_stepper_of(motion), trajectory)
+    is_weak = margins(trajectory, sizes) <= tolerance
+    places = np.argwhere(is_weak)
+    if len(places) > MAX_PAIRS:
         raise ValueError(
-            f"{len(pairs)} node-steps are in weak contact, more than {MAX_PAIRS}; does the body "
+            f"{len(places)} node-steps are in weak contact, more than {MAX_PAIRS}; does the body "
             "rest on the obstacle without a force? Start it at a distance, or lower the tolerance"
         )
 
@@ -115,13 +119,11 @@ def certify(
     by_impulse = np.asarray(by_impulse)[is_weak]
     # Row j: derivatives of the gap of weak pair j by the parameters and by all weak impulses.
     rows, gap_by_impulse = [], []
-    for step, pair in pairs.tolist():
-        row, response = _gap_sensitivity(
-            motion, problem.controls, parameters, *probe, step + 1, pair
-        )
+    for place in places:
+        row, response = _gap_sensitivity(motion, problem.controls, parameters, *probe, place)
         rows.append(row)
         gap_by_impulse.append(np.asarray(response)[is_weak])
-    compliance = np.array(gap_by_impulse).reshape(len(pairs), len(pairs))
+    compliance = np.array(gap_by_impulse).reshape(len(places), len(places))
 
     free = free_variables(problem.bounds, parameters, derivative)
     multiplier, signs, excess = _multipliers(
@@ -134,14 +136,13 @@ def certify(
     return Stationarity(
         residual=math.hypot(math.sqrt(max(float(problem.dot(step, step)), 0.0)), excess),
         gradient_norm=float(problem.gradient_norm(problem.evaluate(parameters))),
-        weak_pairs=pairs,
+        weak_pairs=places[:, [0, 2]],
+        contact_problem=places[:, 1],
         gap_multiplier=multiplier,
         impulse_multiplier=by_impulse - compliance.T @ multiplier,
         wrong_signs=signs,
-        weak_gap=float(np.max(gap[is_weak], initial=0.0) / max(sizes[0], np.finfo(float).tiny)),
-        weak_impulse=float(
-            np.max(impulse[is_weak], initial=0.0) / max(sizes[1], np.finfo(float).tiny)
-        ),
+        weak_gap=float(np.max(gap[is_weak], initial=0.0)) / sizes.gap,
+        weak_impulse=float(np.max(impulse[is_weak], initial=0.0)) / sizes.impulse,
     )
 
 
@@ -200,16 +201,19 @@ def _multipliers(
     return solution[:m], wrong, float(np.linalg.norm(excess))
 
 
-def _impulse_size(motion: Any, trajectory: Trajectory) -> float:
-    """Return the largest impulse of the motion, or the momentum of a node if that is larger."""
+def _stepper_of(motion: Callable[[Array], Trajectory]) -> Stepper:
+    """Return the stepper in the pytree of a motion."""
+    found = [x for x in jax.tree.leaves(motion, is_leaf=_is_stepper) if _is_stepper(x)]
+    if not found:
+        raise ValueError(
+            "the motion holds no stepper; hand over motion= as a bound method of a pytree that "
+            "holds it, or jax.tree_util.Partial(function, stepper)"
+        )
+    return found[0]
 
-    def is_stepper(node: Any) -> bool:
-        return isinstance(node, Stepper)
 
-    steppers = filter(is_stepper, jax.tree.leaves(motion, is_leaf=is_stepper))
-    mass = max((float(jnp.max(s.system.mass.diagonal())) for s in steppers), default=0.0)
-    momentum = mass * float(jnp.max(jnp.abs(trajectory.velocity)))
-    return max(float(jnp.max(trajectory.contact_impulse, initial=0.0)), momentum)
+def _is_stepper(node: object) -> bool:
+    return isinstance(node, Stepper)
 
 
 @jax.jit
@@ -220,14 +224,16 @@ def _run(motion: Any, controls: Any, parameters: Array) -> Trajectory:
 @jax.jit
 def _objective_sensitivity(objective, controls, parameters, is_open, push):
     def value(p, z):
-        return with_probe(objective, is_open, z)(controls(p))
+        probe = StepPerturbation(push=z, is_open=is_open)
+        return with_perturbation(objective, probe)(controls(p))
 
     return jax.grad(value, argnums=(0, 1))(parameters, push)
 
 
 @jax.jit
-def _gap_sensitivity(motion, controls, parameters, is_open, push, level, pair):
+def _gap_sensitivity(motion, controls, parameters, is_open, push, place):
     def gap(p, z):
-        return with_probe(motion, is_open, z)(controls(p)).gap[level, pair]
+        probe = StepPerturbation(push=z, is_open=is_open)
+        return with_perturbation(motion, probe)(controls(p)).contact.gap[tuple(place)]
 
     return jax.grad(gap, argnums=(0, 1))(parameters, push)

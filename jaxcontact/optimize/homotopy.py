@@ -14,8 +14,9 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
-from jaxcontact.contact.relaxed import RelaxedContact, with_contact
+from jaxcontact.contact import RelaxedContact
 from jaxcontact.control.problem import Point, Problem
+from jaxcontact.motion.stepper import with_contact
 from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
 from jaxcontact.optimize.trust_region import conjugate_gradient_path

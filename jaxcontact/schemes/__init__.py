@@ -3,7 +3,14 @@
 from jaxcontact.schemes.backward_euler import BackwardEuler
 from jaxcontact.schemes.contact_implicit import ContactImplicit
 from jaxcontact.schemes.contact_stabilized import ContactStabilized
-from jaxcontact.schemes.interface import EnergyFlow, Scheme, StepInfo, StepState
+from jaxcontact.schemes.interface import (
+    Losses,
+    Operators,
+    Scheme,
+    SchemeMatrices,
+    StepResult,
+    StepState,
+)
 from jaxcontact.schemes.redistributed_mass import RedistributedMass
 from jaxcontact.schemes.trapezoidal import Trapezoidal
 
@@ -11,10 +18,12 @@ __all__ = [
     "BackwardEuler",
     "ContactImplicit",
     "ContactStabilized",
-    "EnergyFlow",
+    "Losses",
+    "Operators",
     "RedistributedMass",
     "Scheme",
-    "StepInfo",
+    "SchemeMatrices",
+    "StepResult",
     "StepState",
     "Trapezoidal",
 ]

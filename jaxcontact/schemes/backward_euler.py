@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.schemes.contact_implicit import ImplicitOperators
-from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
-from jaxcontact.schemes.terms import gap_resolution, viscous_loss
+from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
+from jaxcontact.schemes.terms import impact_loss, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -38,54 +37,35 @@ class BackwardEuler:
     Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011), section 4.
     """
 
-    def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> ImplicitOperators:
-        """Return the operators: M + tau B + tau^2 A factorised once."""
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return M and M + tau B + tau^2 A."""
         matrix = system.mass + dt**2 * system.stiffness
         if system.viscosity is not None:
             matrix = matrix + dt * system.viscosity
-        return ImplicitOperators(system.mass, make_problem(matrix))
+        return SchemeMatrices(system.mass, (matrix,))
 
-    def memory(self, system: System, operators: ImplicitOperators) -> tuple[()]:
+    def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
     def step(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        state: StepState,
-        load: Array,
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
         w, solution = operators.problem.solve(
             operators.mass @ v - dt * (system.stiffness @ y - load),
-            bound=(system.gap - system.normals @ y) / dt,
-            resolution=gap_resolution(system, y) / dt,
-            guess=state.guess,
+            velocity_bound(system, dt, y, v),
+            state.guesses[0],
         )
-        new = StepState(y + dt * w, w, solution.multiplier, solution.guess)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
+        return StepResult(y + dt * w, w, solution.multiplier, (solution,))
 
-    def energy_flow(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        old: StepState,
-        new: StepState,
-        load: Array,
-    ) -> EnergyFlow:
-        """Return work, viscous loss tau w.Bw, impact loss lam.(psi - N y)/tau, numerical loss."""
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return lam.(psi - N y)/tau and 1/2 |v' - v|_M^2 + 1/2 |y' - y|_A^2."""
         increment = new.displacement - old.displacement
         jump = new.velocity - old.velocity
         damping = jnp.dot(jump, operators.mass @ jump)
         damping = damping + jnp.dot(increment, system.stiffness @ increment)
-        gap = system.gap - system.normals @ old.displacement
-        return EnergyFlow(
-            work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss(system, dt, increment),
-            impact_loss=jnp.dot(new.impulse, gap) / dt,
-            numerical_loss=0.5 * damping,
-        )
+        return Losses(impact_loss(system, dt, old, new), 0.5 * damping)

@@ -13,27 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import ContactProblem
-from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
-from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
+from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
+from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ImplicitOperators:
-    """Operators of a scheme with one contact problem per step."""
-
-    mass: ComponentwiseMatrix | SymmetricMatrix
-    """Mass matrix of the kinetic energy, (n, n) [kg]."""
-
-    problem: ContactProblem
-    """The contact problem of the matrix D."""
 
 
 @dataclass(frozen=True)
@@ -52,51 +36,28 @@ class ContactImplicit:
     Source: Kane, Repetto, Ortiz, Marsden, CMAME 180 (1999); paper (3.16).
     """
 
-    def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> ImplicitOperators:
-        """Return the operators: D factorised once."""
-        matrix = system.mass + 0.25 * dt**2 * system.stiffness
-        if system.viscosity is not None:
-            matrix = matrix + 0.5 * dt * system.viscosity
-        return ImplicitOperators(system.mass, make_problem(matrix))
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return M and D."""
+        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt),))
 
-    def memory(self, system: System, operators: ImplicitOperators) -> tuple[()]:
+    def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
     def step(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        state: StepState,
-        load: Array,
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
-        rhs = operators.mass @ v - 0.5 * dt * (system.stiffness @ y - load)
         w, solution = operators.problem.solve(
-            rhs,
-            bound=(system.gap - system.normals @ y) / dt,
-            resolution=gap_resolution(system, y) / dt,
-            guess=state.guess,
+            operators.mass @ v - 0.5 * dt * (system.stiffness @ y - load),
+            velocity_bound(system, dt, y, v),
+            state.guesses[0],
         )
-        new = StepState(y + dt * w, 2.0 * w - v, 2.0 * solution.multiplier, solution.guess)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
+        return StepResult(y + dt * w, 2.0 * w - v, 2.0 * solution.multiplier, (solution,))
 
-    def energy_flow(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        old: StepState,
-        new: StepState,
-        load: Array,
-    ) -> EnergyFlow:
-        """Return work tau w.f', viscous loss tau w.Bw and impact loss lam.(psi - N y)/tau."""
-        increment = new.displacement - old.displacement
-        gap = system.gap - system.normals @ old.displacement
-        return EnergyFlow(
-            work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss(system, dt, increment),
-            impact_loss=jnp.dot(new.impulse, gap) / dt,
-        )
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return the impact loss lam.(psi - N y)/tau."""
+        return Losses(impact_loss(system, dt, old, new))

@@ -14,31 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import ContactProblem, Guess
-from jaxcontact.schemes.contact_implicit import ContactImplicit
-from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
-from jaxcontact.schemes.terms import gap_resolution, viscous_loss
-from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
+from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
+from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class StabilizedOperators:
-    """Operators of a scheme with a predictor in the norm of the mass."""
-
-    mass: ComponentwiseMatrix | SymmetricMatrix
-    """Mass matrix of the kinetic energy, (n, n) [kg]."""
-
-    predictor: ContactProblem
-    """The contact problem of the mass matrix M."""
-
-    problem: ContactProblem
-    """The contact problem of the matrix D."""
 
 
 @dataclass(frozen=True)
@@ -59,61 +40,34 @@ class ContactStabilized:
     Source: Deuflhard, Krause, Ertel, Int. J. Numer. Meth. Engng 73 (2008) 1274-1290.
     """
 
-    def prepare(
-        self, system: System, dt: Array, make_problem: ProblemFactory
-    ) -> StabilizedOperators:
-        """Return the operators: M and D factorised once."""
-        trapezoidal = ContactImplicit().prepare(system, dt, make_problem)
-        predictor = make_problem(system.mass.expand())
-        return StabilizedOperators(system.mass, predictor, trapezoidal.problem)
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return M, and D and M for the contact problems of the step and of its predictor."""
+        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt), system.mass.expand()))
 
-    def memory(self, system: System, operators: StabilizedOperators) -> Guess:
-        """Return where the contact problem of the first predictor starts."""
-        return operators.predictor.first_guess()
+    def first_carry(self, system: System) -> tuple[()]:
+        """Return (): displacement and velocity are all a step needs."""
+        return ()
 
     def step(
-        self,
-        system: System,
-        operators: StabilizedOperators,
-        dt: Array,
-        state: StepState,
-        load: Array,
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
-        contact = {
-            "bound": (system.gap - system.normals @ y) / dt,
-            "resolution": gap_resolution(system, y) / dt,
-        }
-        u, predicted = operators.predictor.solve(operators.mass @ v, **contact, guess=state.memory)
+        problem, predictor = operators.problems
+        guess, first_guess = state.guesses
+        bound = velocity_bound(system, dt, y, v)
+        u, predicted = predictor.solve(operators.mass @ v, bound, first_guess)
         rhs = operators.mass @ u - 0.5 * dt * (system.stiffness @ y - load)
-        w, solution = operators.problem.solve(rhs, **contact, guess=state.guess)
+        w, solution = problem.solve(rhs, bound, guess)
         velocity, impulse = v + 2.0 * (w - u), 2.0 * solution.multiplier
-        new = StepState(y + dt * w, velocity, impulse, solution.guess, predicted.guess)
-        return new, StepInfo(
-            jnp.maximum(predicted.iterations, solution.iterations),
-            jnp.maximum(predicted.status, solution.status),
-            jnp.maximum(predicted.residual, solution.residual),
-            predicted.weak | solution.weak,
-        )
+        return StepResult(y + dt * w, velocity, impulse, (solution, predicted))
 
-    def energy_flow(
-        self,
-        system: System,
-        operators: StabilizedOperators,
-        dt: Array,
-        old: StepState,
-        new: StepState,
-        load: Array,
-    ) -> EnergyFlow:
-        """Return work, viscous loss and the impact losses of the step and of its predictor."""
-        increment = new.displacement - old.displacement
-        gap = system.gap - system.normals @ old.displacement
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return the impact losses of the step and of its predictor."""
         # v - u, the velocity that the predictor takes away: mu itself is not kept.
+        increment = new.displacement - old.displacement
         taken = 0.5 * (old.velocity + new.velocity) - increment / dt
         predictor_loss = -jnp.dot(taken, operators.mass @ (new.velocity - old.velocity))
-        return EnergyFlow(
-            work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss(system, dt, increment),
-            impact_loss=jnp.dot(new.impulse, gap) / dt + predictor_loss,
-        )
+        return Losses(impact_loss(system, dt, old, new) + predictor_loss)

@@ -1,15 +1,51 @@
-"""What a time-stepping scheme is: an option object that prepares operators and makes a step."""
+"""What a time-stepping scheme is: an option object that names its matrices and makes a step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import ContactProblem, Guess
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.contact import ContactProblem, Guess, Solution
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
+
+
+class SchemeMatrices(NamedTuple):
+    """What a scheme asks to be factorised."""
+
+    mass: ComponentwiseMatrix | SymmetricMatrix
+    """Mass matrix of the kinetic energy, (n, n) [kg]."""
+
+    problems: tuple[SymmetricMatrix, ...]
+    """The SPD matrix of each contact problem of a step, (n, n). The first one is that whose
+    solution is the contact at the end of the step."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Operators:
+    """What a step works with, made from `SchemeMatrices` by `prepare`."""
+
+    mass: ComponentwiseMatrix | SymmetricMatrix
+    """Mass matrix of the kinetic energy, (n, n) [kg]."""
+
+    problems: tuple[ContactProblem, ...]
+    """The contact problems of a step, P of them, each with its matrix factorised."""
+
+    @property
+    def problem(self) -> ContactProblem:
+        """The contact problem whose solution is the contact at the end of the step."""
+        return self.problems[0]
+
+    def changed(self, change: Callable[[int, ContactProblem], ContactProblem]) -> Operators:
+        """Return operators with every contact problem replaced; `change` gets its number too."""
+        changed = tuple(change(i, problem) for i, problem in enumerate(self.problems))
+        return replace(self, problems=changed)
 
 
 class StepState(NamedTuple):
@@ -24,68 +60,80 @@ class StepState(NamedTuple):
     impulse: Array
     """Contact impulse lam of the last step, (C,) [N s]."""
 
-    guess: Guess
-    """Where the contact problem starts: the active pairs (C,) bool of the last step, and more."""
+    guesses: tuple[Guess, ...]
+    """Where each contact problem starts: what the last step ended with."""
 
-    memory: Any = ()
-    """What else the scheme hands on, see `Scheme.memory`."""
-
-
-class StepInfo(NamedTuple):
-    """How the contact problems of a step were solved."""
-
-    iterations: Array
-    """Iterations of the contact solver, int32."""
-
-    status: Array
-    """Worst `Status` of the step, int32."""
-
-    residual: Array
-    """Largest relative KKT residual of the step, scalar."""
-
-    weak: Array
-    """Pairs in weak contact in a contact problem of the step, (C,) bool."""
+    carry: Any = ()
+    """What else the scheme hands on, see `Scheme.first_carry`."""
 
 
-class EnergyFlow(NamedTuple):
-    """Where the energy of a step went; each scalar, [J]."""
+class StepResult(NamedTuple):
+    """What a step makes of a state."""
 
-    work: Array
-    """Work of the loads on the body."""
+    displacement: Array
+    """y', (n,) [m]."""
 
-    viscous_loss: Array
-    """Energy dissipated by the viscosity, not negative."""
+    velocity: Array
+    """v', (n,) [m/s]."""
 
-    impact_loss: Array
+    impulse: Array
+    """Contact impulse lam of the step, (C,) [N s]."""
+
+    solutions: tuple[Solution, ...]
+    """Solutions of the contact problems, in the order of `Operators.problems`."""
+
+    carry: Any = ()
+    """What else the scheme hands on, see `Scheme.first_carry`."""
+
+    def state(self) -> StepState:
+        """Return what the next step starts from."""
+        guesses = tuple(solution.guess for solution in self.solutions)
+        return StepState(self.displacement, self.velocity, self.impulse, guesses, self.carry)
+
+
+class Losses(NamedTuple):
+    """Where energy was lost in a step beside viscosity; each scalar, [J]."""
+
+    impact: Array
     """Energy taken by the contact (negative: contact has added energy)."""
 
-    numerical_loss: Array | float = 0.0
+    numerical: Array | float = 0.0
     """Energy taken by the time discretisation away from contact; zero for most schemes."""
 
 
-#: Makes the contact problem of an SPD matrix with the system's contact normals.
-ProblemFactory = Callable[[SymmetricMatrix], ContactProblem]
-
-
+@runtime_checkable
 class Scheme(Protocol):
     """A time-stepping scheme: static, hashable, without arrays."""
 
-    def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> Any:
-        """Return the operators of the scheme, a pytree with at least `.mass`."""
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return the mass matrix of the ledger and the matrices of the contact problems."""
         ...
 
-    def memory(self, system: System, operators: Any) -> Any:
+    def first_carry(self, system: System) -> Any:
         """Return what a step must remember beside the state, at the start; () for most schemes."""
         ...
 
     def step(
-        self, system: System, operators: Any, dt: Array, state: StepState, load: Array
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
         ...
 
-    def energy_flow(
-        self, system: System, operators: Any, dt: Array, old: StepState, new: StepState, load: Array
-    ) -> EnergyFlow:
-        """Return the energy flow of a step that was made."""
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return what a step that was made has lost beside viscosity."""
         ...
+
+
+def first_state(
+    scheme: Scheme, system: System, operators: Operators, displacement: Array, velocity: Array
+) -> StepState:
+    """Return the state at time zero, from y and v, (n,) each: nothing is in contact yet."""
+    return StepState(
+        displacement=displacement,
+        velocity=velocity,
+        impulse=jnp.zeros(system.normals.count, system.dtype),
+        guesses=tuple(problem.form.first_guess() for problem in operators.problems),
+        carry=scheme.first_carry(system),
+    )

@@ -19,29 +19,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.contact import ContactProblem
-from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
+from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
 from jaxcontact.schemes.mass_redistribution import redistribute, tangential_projection
-from jaxcontact.schemes.terms import gap_resolution, viscous_loss
+from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.block_matrix import from_symmetric
-from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class RedistributedOperators:
-    """Operators of the scheme with massless contact nodes."""
-
-    mass: ComponentwiseMatrix | SymmetricMatrix
-    """M_r, singular: M_r N^T = 0, (n, n) [kg]."""
-
-    problem: ContactProblem
-    """The contact problem of the matrix D."""
 
 
 @dataclass(frozen=True)
@@ -68,43 +53,31 @@ class RedistributedMass:
     Wohlmuth, Int. J. Numer. Meth. Engng 73 (2008) 1206-1225.
     """
 
-    def prepare(
-        self, system: System, dt: Array, make_problem: ProblemFactory
-    ) -> RedistributedOperators:
-        """Return the operators: M_r, and D factorised once.
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return M_r and D.
 
         Raises:
             ValueError: if the contact pairs are not one per node, or the mesh is too coarse to
                 move the mass of the contact nodes inside.
         """
-        d, n_nodes = system.dimension, len(system.free_nodes)
         if system.normals.count == 0:
-            mass = system.mass
-            matrix = mass + 0.25 * dt**2 * system.stiffness
-            if system.viscosity is not None:
-                matrix = matrix + 0.5 * dt * system.viscosity
-            return RedistributedOperators(mass, make_problem(matrix))
+            return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt),))
+        d, n_nodes = system.dimension, len(system.free_nodes)
         mass = redistribute(system)
         matrix = mass.plus(from_symmetric(system.stiffness, d).scaled(0.25 * dt**2))
         if system.viscosity is not None:
             damping = from_symmetric(system.viscosity, d).scaled(0.25 * dt)
             tangential = tangential_projection(system)
             matrix = matrix.plus(damping).plus(tangential @ damping @ tangential)
-        problem = make_problem(matrix.to_symmetric(n_nodes))
-        return RedistributedOperators(mass.to_symmetric(n_nodes), problem)
+        return SchemeMatrices(mass.to_symmetric(n_nodes), (matrix.to_symmetric(n_nodes),))
 
-    def memory(self, system: System, operators: RedistributedOperators) -> tuple[()]:
+    def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
         return ()
 
     def step(
-        self,
-        system: System,
-        operators: RedistributedOperators,
-        dt: Array,
-        state: StepState,
-        load: Array,
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
         imbalance = system.stiffness @ y - load
@@ -113,40 +86,23 @@ class RedistributedMass:
         if system.viscosity is not None:
             pull = system.viscosity @ (v - _remove_normal(system, v))
             rhs = rhs - 0.25 * dt * _remove_normal(system, pull)
-        w, solution = operators.problem.solve(
-            rhs,
-            bound=(system.gap - system.normals @ y) / dt,
-            resolution=gap_resolution(system, y) / dt,
-            guess=state.guess,
-        )
+        bound = velocity_bound(system, dt, y, v)
+        w, solution = operators.problem.solve(rhs, bound, state.guesses[0])
         velocity = w + _remove_normal(system, w - v)
-        new = StepState(y + dt * w, velocity, 4.0 * solution.multiplier, solution.guess)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
+        return StepResult(y + dt * w, velocity, 4.0 * solution.multiplier, (solution,))
 
-    def energy_flow(
-        self,
-        system: System,
-        operators: RedistributedOperators,
-        dt: Array,
-        old: StepState,
-        new: StepState,
-        load: Array,
-    ) -> EnergyFlow:
-        """Return work, viscous loss, impact loss lam.(psi - N y)/tau and the numerical loss."""
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return the impact loss lam.(psi - N y)/tau and the numerical loss."""
         increment = new.displacement - old.displacement
         normal = increment - _remove_normal(system, increment)
-        numerical_loss = 0.5 * jnp.dot(normal, system.stiffness @ increment)
+        numerical = 0.5 * jnp.dot(normal, system.stiffness @ increment)
         if system.viscosity is not None:
             jump = normal - dt * (old.velocity - _remove_normal(system, old.velocity))
             pull = system.viscosity @ jump
-            numerical_loss = numerical_loss - 0.5 / dt * jnp.dot(increment - normal, pull)
-        gap = system.gap - system.normals @ old.displacement
-        return EnergyFlow(
-            work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss(system, dt, increment),
-            impact_loss=jnp.dot(new.impulse, gap) / dt,
-            numerical_loss=numerical_loss,
-        )
+            numerical = numerical - 0.5 / dt * jnp.dot(increment - normal, pull)
+        return Losses(impact_loss(system, dt, old, new), numerical)
 
 
 def _remove_normal(system: System, x: Array) -> Array:

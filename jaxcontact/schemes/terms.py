@@ -1,4 +1,4 @@
-"""Terms that the schemes share: the viscous loss of a step and the rounding error of a gap."""
+"""Terms that the schemes share: trapezoidal matrix, admissible velocity, losses of a step."""
 
 from __future__ import annotations
 
@@ -6,7 +6,47 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.contact import Bound
+from jaxcontact.schemes.interface import StepState
+from jaxcontact.system.sparse import SymmetricMatrix
 from jaxcontact.system.system import System
+
+
+def trapezoidal_matrix(system: System, dt: Array) -> SymmetricMatrix:
+    """Return D = M + tau/2 B + tau^2/4 A, (n, n)."""
+    matrix = system.mass + 0.25 * dt**2 * system.stiffness
+    return matrix if system.viscosity is None else matrix + 0.5 * dt * system.viscosity
+
+
+def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:
+    """Return (psi - N y)/tau, the largest admissible normal velocity, with its rounding error.
+
+    Args:
+        system: the system.
+        dt: tau, scalar [s].
+        y: displacement at the start of the step, (n,) [m].
+        v: velocity at the start of the step, (n,) [m/s]; it bounds the rounding of the free motion.
+    """
+    resolution = gap_resolution(system, y) / dt + _rounding(system, v)
+    return Bound((system.gap - system.normals @ y) / dt, resolution)
+
+
+def gap_resolution(system: System, y: Array) -> Array:
+    """Return the rounding error of the gap psi - N y and of what follows from y, (C,) [m].
+
+    A smaller gap is closed. The geometry has the error of its positions, and the free motion that
+    of A y, whose terms cancel: tau N D^-1 (tau A y) is at most some max |y|, for every tau.
+    """
+    local = jnp.sum(jnp.abs(system.normals.weights * y[system.normals.unknowns]), axis=1)
+    local = jax.lax.stop_gradient(4.0 * jnp.finfo(y.dtype).eps * local)
+    return jax.lax.stop_gradient(system.gap_rounding) + local + _rounding(system, y)
+
+
+def _rounding(system: System, x: Array) -> Array:
+    """Return the rounding error of N x' for an x' that is made of terms as large as x, (C,)."""
+    largest = jnp.max(jnp.abs(system.normals.weights), axis=1, initial=0.0)
+    size = largest * jnp.max(jnp.abs(x), initial=0.0)
+    return jax.lax.stop_gradient(4.0 * jnp.finfo(x.dtype).eps * size)
 
 
 def viscous_loss(system: System, dt: Array, increment: Array) -> Array:
@@ -16,8 +56,7 @@ def viscous_loss(system: System, dt: Array, increment: Array) -> Array:
     return jnp.dot(increment, system.viscosity @ increment) / dt
 
 
-def gap_resolution(system: System, y: Array) -> Array:
-    """Return the rounding error of the gap psi - N y, (C,) [m]: a smaller gap is closed."""
-    normal_displacement = jnp.abs(system.normals.weights * y[system.normals.unknowns]).sum(axis=1)
-    magnitude = jnp.abs(system.gap) + normal_displacement
-    return jax.lax.stop_gradient(4.0 * jnp.finfo(y.dtype).eps * magnitude)
+def impact_loss(system: System, dt: Array, old: StepState, new: StepState) -> Array:
+    """Return lam.(psi - N y)/tau [J]: what an impulse takes that acts at the new gap."""
+    gap = system.gap - system.normals @ old.displacement
+    return jnp.dot(new.impulse, gap) / dt

@@ -6,7 +6,7 @@ In the midpoint velocity w, with D = M + tau/2 B + tau^2/4 A and contact forces 
     N (y + tau w) <= psi,   c' >= 0,   c' . (psi - N (y + tau w)) = 0,
     y' = y + tau w,   v' = 2 w - v.
 
-The impulse of a step is tau (c + c')/2..
+The impulse of a step is tau (c + c')/2.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.schemes.contact_implicit import ContactImplicit, ImplicitOperators
-from jaxcontact.schemes.interface import EnergyFlow, ProblemFactory, StepInfo, StepState
-from jaxcontact.schemes.terms import gap_resolution, viscous_loss
+from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
+from jaxcontact.schemes.terms import trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -42,49 +41,32 @@ class Trapezoidal:
     Comput. 33 (2011) and Krause, Walloth, Appl. Numer. Math. 62 (2012).
     """
 
-    def prepare(self, system: System, dt: Array, make_problem: ProblemFactory) -> ImplicitOperators:
-        """Return the operators: D factorised once."""
-        return ContactImplicit().prepare(system, dt, make_problem)
+    def matrices(self, system: System, dt: Array) -> SchemeMatrices:
+        """Return M and D."""
+        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt),))
 
-    def memory(self, system: System, operators: ImplicitOperators) -> Array:
+    def first_carry(self, system: System) -> Array:
         """Return the contact force c at the start, (C,) [N]: none."""
         return jnp.zeros(system.normals.count, system.dtype)
 
     def step(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        state: StepState,
-        load: Array,
-    ) -> tuple[StepState, StepInfo]:
+        self, system: System, operators: Operators, dt: Array, state: StepState, load: Array
+    ) -> StepResult:
         """Advance by one step under the constant load (n,) [N]."""
-        y, v, old_force = state.displacement, state.velocity, state.memory
+        y, v, old_force = state.displacement, state.velocity, state.carry
         rhs = operators.mass @ v - 0.5 * dt * (system.stiffness @ y - load)
         w, solution = operators.problem.solve(
             rhs - 0.25 * dt * system.normals.transposed_product(old_force, system.size),
-            bound=(system.gap - system.normals @ y) / dt,
-            resolution=gap_resolution(system, y) / dt,
-            guess=state.guess,
+            velocity_bound(system, dt, y, v),
+            state.guesses[0],
         )
         force = 4.0 / dt * solution.multiplier
         impulse = 0.5 * dt * (old_force + force)
-        new = StepState(y + dt * w, 2.0 * w - v, impulse, solution.guess, force)
-        return new, StepInfo(solution.iterations, solution.status, solution.residual, solution.weak)
+        return StepResult(y + dt * w, 2.0 * w - v, impulse, (solution,), force)
 
-    def energy_flow(
-        self,
-        system: System,
-        operators: ImplicitOperators,
-        dt: Array,
-        old: StepState,
-        new: StepState,
-        load: Array,
-    ) -> EnergyFlow:
-        """Return work, viscous loss tau w.Bw and impact loss lam.Nw, of either sign."""
+    def losses(
+        self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
+    ) -> Losses:
+        """Return the impact loss lam.Nw, of either sign."""
         increment = new.displacement - old.displacement
-        return EnergyFlow(
-            work=jnp.dot(increment, load),
-            viscous_loss=viscous_loss(system, dt, increment),
-            impact_loss=jnp.dot(new.impulse, system.normals @ increment) / dt,
-        )
+        return Losses(jnp.dot(new.impulse, system.normals @ increment) / dt)

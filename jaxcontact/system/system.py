@@ -64,6 +64,9 @@ class System:
     gap: Array
     """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
 
+    gap_rounding: Array
+    """Rounding error of the gap, (C,) [m]: that of the positions it was measured between."""
+
     load: Array
     """Constant load of body force and traction, (n,) [N]."""
 
@@ -122,7 +125,10 @@ class System:
             raise ValueError(
                 f"gap has shape {gap.shape}; pass {self.gap.shape}, one for each of `contact_nodes`"
             )
-        return replace(self, gap=jnp.asarray(gap, self.dtype))
+        gap = jnp.asarray(gap, self.dtype)
+        own = 4.0 * jnp.finfo(self.dtype).eps * jnp.abs(gap)
+        rounding = jnp.maximum(self.gap_rounding, jax.lax.stop_gradient(own))
+        return replace(self, gap=gap, gap_rounding=rounding)
 
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
@@ -192,6 +198,8 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
         pairs = contact_pairs(scene, jnp.asarray(mesh.points, dtype))
+    places = jnp.abs(pairs.normals * points[pairs.nodes]).sum(axis=1)
+    rounding = 4.0 * jnp.finfo(dtype).eps * jax.lax.stop_gradient(places + jnp.abs(pairs.gap))
     components = np.arange(dimension, dtype=np.int32)
     unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
@@ -206,6 +214,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
         normals=ContactNormals(pairs.normals, unknowns, dimension * free_nodes.size),
         gap=pairs.gap,
+        gap_rounding=rounding,
         load=values.load[free_nodes].reshape(-1),
         contact_nodes=pairs.nodes,
         contact_area=pairs.area,

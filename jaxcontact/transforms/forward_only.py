@@ -9,25 +9,21 @@ from jax.interpreters import ad, batching, mlir
 _forward_only = Primitive("forward_only")
 
 
-def forward_only(x: Array) -> Array:
+def forward_only(x: Array, advice: str) -> Array:
     """Return x.
 
-    Derivative: forward mode; reverse mode raises a TypeError.
+    Derivative: forward mode; reverse mode raises a TypeError with the advice.
     """
-    return _forward_only.bind(x)
+    return _forward_only.bind(x, advice=advice)
 
 
-def _transpose(cotangent, x):
+def _transpose(cotangent, x, *, advice):
     del cotangent, x
-    raise TypeError(
-        "weak_contact=CriticalCone() is the one-sided derivative, which is not linear in the "
-        "direction: it has no gradient. Use jax.jvp or directional_derivative with it, and for "
-        "jax.grad choose a linear branch: Strong(), Inactive() or AlongDirection(direction)"
-    )
+    raise TypeError(advice)
 
 
-_forward_only.def_impl(lambda x: x)
-_forward_only.def_abstract_eval(lambda x: x)
+_forward_only.def_impl(lambda x, *, advice: x)
+_forward_only.def_abstract_eval(lambda x, *, advice: x)
 ad.deflinear2(_forward_only, _transpose)
 batching.defvectorized(_forward_only)
-mlir.register_lowering(_forward_only, lambda context, x: [x])
+mlir.register_lowering(_forward_only, lambda context, x, *, advice: [x])

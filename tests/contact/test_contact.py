@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import jaxcontact as jc
 from jaxcontact.contact import Guess, Status
-from jaxcontact.contact.complementarity import solve_on_set
+from jaxcontact.contact.complementarity import solve_compliance
 
 # Both solvers stop at a residual of 1e-11 of the largest violation.
 KKT_TOLERANCE = 1e-10
@@ -51,7 +51,7 @@ def random_problem(seed, coupling, n=N_PAIRS):
 def kkt_violation(compliance, offset, p):
     """Sign, non-penetration and complementarity, relative to the largest violation"""
     g = compliance @ p + offset
-    size = np.max(np.maximum(-offset, 0.0)) + np.finfo(float).tiny
+    size = np.max(np.maximum(-offset, 0.0)) + 1e-100  # its square is a number
     diagonal = np.diagonal(compliance)
     return max(
         np.max(-diagonal * p) / size, np.max(-g) / size, np.max(np.abs(p * g * diagonal)) / size**2
@@ -137,7 +137,8 @@ def test_newton_needs_one_set_if_it_starts_with_the_right_one():
 def test_newton_on_a_cycle_falls_back_and_still_solves():
     compliance, offset = CYCLING_ROOT @ CYCLING_ROOT.T, CYCLING_OFFSET
     solution = solve(jc.SemismoothNewton(), compliance, offset)
-    assert int(solution.iterations) == 30  # the whole budget
+    # The whole budget, and some pairs one at a time.
+    assert 30 < int(solution.iterations) < 50
     assert int(solution.status) == Status.FALLBACK
     p = np.asarray(solution.multiplier)
     assert kkt_violation(compliance, offset, p) < KKT_TOLERANCE
@@ -151,17 +152,46 @@ def test_newton_out_of_steps_falls_back_and_still_solves():
     assert kkt_violation(compliance, offset, np.asarray(solution.multiplier)) < KKT_TOLERANCE
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [jc.SemismoothNewton(max_steps=1, max_sweeps=1), jc.ProjectedGaussSeidel(max_sweeps=1)],
-)
-def test_contact_solver_out_of_budget_says_so(solver):
+def test_contact_solver_out_of_budget_says_so():
     compliance, offset = random_problem(4, 1.0)
-    solution = solve(solver, compliance, offset)
+    solution = solve(jc.ProjectedGaussSeidel(max_sweeps=1), compliance, offset)
     assert int(solution.status) == Status.NOT_CONVERGED
     violation = kkt_violation(compliance, offset, np.asarray(solution.multiplier))
     assert violation > KKT_TOLERANCE
     assert float(solution.residual) > KKT_TOLERANCE
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-16, 1e-12, 1e-8])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_contact_solver_shares_the_force_of_twin_pairs(solver, apart):
+    # Pairs 0 and 1 are one contact but for rounding, 2 leans on both.
+    rows = np.array([[1.0, 0.0, 0.0], [1.0, apart, 0.0], [0.5, 0.0, 1.0]])
+    compliance, offset = rows @ rows.T, np.array([-1.0, -1.0, -0.2])
+    solution = solve(solver, compliance, offset)
+    assert int(solution.status) == Status.CONVERGED
+    p = np.asarray(solution.multiplier)
+    assert kkt_violation(compliance, offset, p) < KKT_TOLERANCE
+    np.testing.assert_allclose(rows[:, 0] @ p, 1.0, rtol=1e-7)
+    again = solve(solver, compliance, offset, solution.active)
+    assert int(again.status) == Status.CONVERGED
+
+
+def test_newton_solves_what_cycles_for_block_pivoting():
+    # Dense random problems without the structure of elasticity: a few of a thousand cycle.
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(3000, 8, 8))
+    compliance = jnp.asarray(roots @ roots.swapaxes(1, 2))
+    offset = jnp.asarray(rng.normal(size=(3000, 8)))
+
+    def solve_one(compliance, offset):
+        nothing = jnp.zeros(8)
+        return jc.SemismoothNewton().solve(compliance, offset, nothing, Guess(nothing > 0))
+
+    solutions = jax.jit(jax.vmap(solve_one))(compliance, offset)
+    status = np.asarray(solutions.status)
+    assert np.all(status <= Status.FALLBACK)
+    assert np.any(status == Status.FALLBACK)
+    assert np.max(np.asarray(solutions.iterations)) < 60
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -211,11 +241,11 @@ def test_contact_solver_without_contact_returns_no_force():
 
 
 @pytest.mark.parametrize("softness", [None, np.linspace(0.1, 0.6, N_PAIRS)])
-def test_solve_on_set_solves_the_rows_of_the_set(softness):
+def test_solve_compliance_solves_the_rows_of_the_set(softness):
     compliance, rhs = random_problem(8, 1.0)
     active = np.array([True, False, True, True, False, False])
     soft = np.zeros(N_PAIRS) if softness is None else softness
-    found = solve_on_set(
+    found = solve_compliance(
         jnp.asarray(compliance),
         jnp.asarray(active),
         None if softness is None else jnp.asarray(softness),

@@ -51,7 +51,8 @@ def test_exchanges_and_factorisations_give_the_principal_pivot_transform(seed, s
         size = np.sqrt(np.abs(np.diag(pivoted.matrix)))
         error = (pivoted.matrix - expected_transform(W, pairs)) / np.outer(size, size)
         assert np.array_equal(pivoted.pairs, pairs)
-        assert np.max(np.abs(error)) < 1e-10
+        # The transform is that of W with the shift 1.6e-10; solutions are refined.
+        assert np.max(np.abs(error)) < 1e-9
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -124,7 +125,7 @@ def test_newton_solves_whatever_became_of_the_kept_transform(noise):
     q = jnp.asarray(np.random.default_rng(3).standard_normal(N_PAIRS))
     nothing = jnp.zeros(N_PAIRS)
     right = solver.solve(W, q, nothing, Guess(pairs_of(0)))
-    kept = right.memory
+    kept = right.workspace
     assert 0 < np.count_nonzero(right.active) < N_PAIRS
     spoilt = kept._replace(matrix=kept.matrix * (1.0 + noise), exchanges=jnp.int32(1))
     again = solver.solve(W, q, nothing, Guess(right.active, spoilt))

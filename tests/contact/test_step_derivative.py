@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
-from jaxcontact.contact import ContactProblem, Guess, Status
+from jaxcontact.contact import Bound, ContactProblem, Guess, Status, contact_form
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 N_UNKNOWNS, N_PAIRS = 8, 4
@@ -45,9 +45,10 @@ def solve(matrix, weights, rhs, bound, solver=SOLVERS[0], weak_contact=None):
     symmetric = SymmetricMatrix((matrix + matrix.T) / 2, jnp.asarray(COLUMNS))
     normals = ContactNormals(weights, jnp.asarray(UNKNOWNS))
     factor = jc.Dense().factorize(*jax.lax.stop_gradient((symmetric, normals)))
-    problem = ContactProblem(symmetric, normals, factor, solver, weak_contact)
+    form = contact_form(factor, solver)
+    problem = ContactProblem(symmetric, normals, form, weak_contact=weak_contact)
     nothing = jnp.zeros(N_PAIRS)
-    w, solution = problem.solve(rhs, bound, nothing, Guess(nothing > 0))
+    w, solution = problem.solve(rhs, Bound(bound, nothing), Guess(nothing > 0))
     return w, solution.multiplier, solution.active, solution.status
 
 
@@ -133,7 +134,7 @@ def test_step_jvp_and_vjp_pass_the_dot_product_test(seed):
         return solve(*data, weak_contact=weak_contact)[:2]
 
     # Forward mode belongs to a named treatment of weak contact, the default is a custom_vjp.
-    _, forward = jax.jvp(partial(states, weak_contact=jc.Strong()), data, tangents)
+    _, forward = jax.jvp(partial(states, weak_contact=jc.ClosedBranch()), data, tangents)
     backward = jax.vjp(states, *data)[1](cotangents)
     left = sum(jnp.vdot(a, b) for a, b in zip(forward, cotangents, strict=True))
     right = sum(jnp.vdot(a, b) for a, b in zip(backward, tangents, strict=True))
@@ -218,13 +219,12 @@ def test_step_gradient_in_weak_contact_counts_it_as_strong():
     touching = jnp.asarray(normals @ np.linalg.solve(matrix, rhs))
     symmetric = SymmetricMatrix(matrix, jnp.asarray(COLUMNS))
     operator = ContactNormals(weights, jnp.asarray(UNKNOWNS))
-    problem = ContactProblem(
-        symmetric, operator, jc.Dense().factorize(symmetric, operator), SOLVERS[0]
-    )
+    form = contact_form(jc.Dense().factorize(symmetric, operator), SOLVERS[0])
+    problem = ContactProblem(symmetric, operator, form)
 
     def normal_velocity(r):
         resolution = jnp.full(N_PAIRS, 1e-13)
-        w, solution = problem.solve(r, touching, resolution, Guess(jnp.zeros(N_PAIRS, bool)))
+        w, solution = problem.solve(r, Bound(touching, resolution), Guess(jnp.zeros(N_PAIRS, bool)))
         return operator @ w, solution.active
 
     jacobian, active = jax.jacrev(normal_velocity, has_aux=True)(rhs)
@@ -259,9 +259,9 @@ def test_step_without_contact_pairs_is_a_linear_solve_with_its_gradients():
         symmetric = SymmetricMatrix((matrix + matrix.T) / 2, jnp.asarray(COLUMNS))
         nothing = ContactNormals(jnp.zeros((0, 2)), jnp.zeros((0, 2), jnp.int32))
         factor = jc.Dense().factorize(jax.lax.stop_gradient(symmetric), nothing)
-        problem = ContactProblem(symmetric, nothing, factor, SOLVERS[0])
+        problem = ContactProblem(symmetric, nothing, contact_form(factor, SOLVERS[0]))
         guess = Guess(jnp.zeros(0, bool))
-        w, solution = problem.solve(rhs, jnp.zeros(0), jnp.zeros(0), guess)
+        w, solution = problem.solve(rhs, Bound(jnp.zeros(0), jnp.zeros(0)), guess)
         return jnp.sum(jnp.sin(w)), (w, solution.status)
 
     (by_matrix, by_rhs), (w, status) = jax.grad(total, (0, 1), has_aux=True)(matrix, rhs)

@@ -1,8 +1,5 @@
 """Every mode of differentiation, users' own JAX code in front, and what a gradient costs."""
 
-import time
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +37,7 @@ def test_gradient_by_vjp_and_by_jvp_and_without_jit_agree():
     direction = random_like(CONTROL)
     _, pull = jax.vjp(value, CONTROL)
     assert relative(pull(jnp.array(1.0))[0], GRADIENT) <= ROUNDING
-    for choice in (jc.Strong(), jc.Inactive(), jc.CriticalCone()):
+    for choice in (jc.ClosedBranch(), jc.OpenBranch(), jc.CriticalCone()):
         _, forward = jax.jvp(
             lambda u, choice=choice: value(u, weak_contact=choice), (CONTROL,), (direction,)
         )
@@ -53,7 +50,7 @@ def check_same(forward, direction):
 
 
 def test_forward_mode_without_a_named_treatment_of_weak_contact_is_refused():
-    with pytest.raises(TypeError, match=r"weak_contact=jc\.Strong\(\)"):
+    with pytest.raises(TypeError, match=r"weak_contact=jc\.ClosedBranch\(\)"):
         jax.jvp(value, (CONTROL,), (CONTROL,))
 
 
@@ -63,7 +60,7 @@ def test_jacobian_by_rows_and_by_columns_agree():
         return final_of(CONTROL + lift)
 
     def final_of(control):
-        trajectory = jc.simulate(STEPPER, control, initial=INITIAL, weak_contact=jc.Strong())
+        trajectory = jc.simulate(STEPPER, control, initial=INITIAL, weak_contact=jc.ClosedBranch())
         return jnp.concatenate([trajectory.velocity[-1, :3].ravel(), trajectory.gap[-1]])
 
     rows = jax.jacrev(by_nodes)(jnp.zeros((1, 3)))
@@ -119,7 +116,7 @@ def test_gradient_with_checkpoints_is_the_same_at_weak_contact_choices_too():
             )
         )
 
-    for choice in (jc.Strong(), jc.Inactive(), jc.AlongDirection(CONTROL)):
+    for choice in (jc.ClosedBranch(), jc.OpenBranch(), jc.AlongDirection(CONTROL)):
         assert relative(jax.grad(checkpointed)(CONTROL, choice), GRADIENT) <= ROUNDING
 
 
@@ -198,37 +195,3 @@ def test_gradient_by_control_computes_no_cotangent_of_a_matrix():
     produced = f":f64[{width},2,{n_nodes},2] = mul"  # outer products of blocks
     assert produced not in program(0)
     assert produced in program(1)
-
-
-@pytest.mark.slow
-def test_gradient_by_material_costs_at_most_twice_the_gradient_by_control():
-    # The claim is 1.6; the test leaves room for a busy machine. Medians of interleaved runs.
-    problem = jc.scenes.half_disc_control(h=1.0, steps=60)
-    stepper = problem.stepper
-
-    def objective(u, scale):
-        stiffness = scale * stepper.system.stiffness
-        matrix = stepper.operators.problem.matrix + (0.25 * problem.dt**2) * (
-            (scale - 1.0) * stepper.system.stiffness
-        )
-        changed = replace_matrices(stepper, stiffness, matrix)
-        return problem.cost()(jc.simulate(changed, problem.control_scale * u), u)
-
-    by_control = jax.jit(jax.grad(objective, 0))
-    by_material = jax.jit(jax.grad(objective, 1))
-    times = {by_control: [], by_material: []}
-    for _ in range(9):
-        for gradient, record in times.items():
-            start = time.perf_counter()
-            jax.block_until_ready(gradient(problem.reference, jnp.array(1.0)))
-            record.append(time.perf_counter() - start)
-    assert np.median(times[by_material][1:]) <= 2.0 * np.median(times[by_control][1:])
-
-
-def replace_matrices(stepper, stiffness, matrix):
-    problem = replace(stepper.operators.problem, matrix=matrix)
-    return replace(
-        stepper,
-        system=replace(stepper.system, stiffness=stiffness),
-        operators=replace(stepper.operators, problem=problem),
-    )

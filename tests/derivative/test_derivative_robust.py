@@ -164,7 +164,7 @@ def products(young, viscosity, height, tilt, control, direction, weight):
         ), jnp.sum(trajectory.active)
 
     _, tangent, count = jax.jvp(
-        lambda u: end(u, jc.Strong()), (control,), (direction,), has_aux=True
+        lambda u: end(u, jc.ClosedBranch()), (control,), (direction,), has_aux=True
     )
     cotangent = jnp.resize(weight, tangent.shape)
     _, pull, _ = jax.vjp(end, control, has_aux=True)

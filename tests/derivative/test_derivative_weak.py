@@ -187,7 +187,7 @@ def test_gradients_of_the_branches_are_the_one_sided_derivatives(dimension, seed
 
         return jax.grad(value)(control)
 
-    strong, inactive = gradient(jc.Strong()), gradient(jc.Inactive())
+    strong, inactive = gradient(jc.ClosedBranch()), gradient(jc.OpenBranch())
     for sign in (1.0, -1.0):
         towards = sign * direction
         tangent = jc.directional_derivative(stepper, control, towards, initial=initial)
@@ -240,7 +240,7 @@ def test_gradient_along_a_direction_of_the_initial_state_chooses_the_branch():
 
     along = jax.grad(value)(initial.velocity, jc.AlongDirection(initial=towards))
     # A faster fall presses the pair.
-    strong = jax.grad(value)(initial.velocity, jc.Strong())
+    strong = jax.grad(value)(initial.velocity, jc.ClosedBranch())
     np.testing.assert_allclose(along, strong, rtol=1e-10)
 
 
@@ -257,7 +257,7 @@ def test_critical_cone_has_no_reverse_mode_and_says_so():
 
 def test_weak_contact_choice_must_be_an_object():
     stepper, control, initial, _ = grazing(1)
-    with pytest.raises(ValueError, match=r"jc\.Strong\(\)"):
+    with pytest.raises(ValueError, match=r"jc\.ClosedBranch\(\)"):
         jc.simulate(stepper, control, initial=initial, weak_contact="strong")
     with pytest.raises(ValueError, match="control"):
         jc.simulate(stepper, steps=STEPS, initial=initial, weak_contact=jc.AlongDirection(control))

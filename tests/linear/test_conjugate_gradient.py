@@ -99,7 +99,7 @@ def test_conjugate_gradient_gives_the_material_gradient_of_dense():
 
 
 def test_conjugate_gradient_holds_a_fixed_active_set():
-    factor = STEPPERS["cg"].operators.problem.factor
+    factor = STEPPERS["cg"].operators.problem.form.factor
     D, N = factor.matrix.to_scipy(), SYSTEM.normals.to_scipy(SYSTEM.size)
     active = np.arange(SYSTEM.normals.count) % 2 == 0
     rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
@@ -254,7 +254,7 @@ def test_conjugate_gradient_keeps_a_heavy_body_at_rest_as_dense():
 
 def residual_of_a_solve(tolerance):
     stepper = jc.prepare(SYSTEM, DT, linear_solver=iterate(tolerance=tolerance))
-    factor = stepper.operators.problem.factor
+    factor = stepper.operators.problem.form.factor
     rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
     residual = rhs - factor.matrix @ factor.solve(rhs)
     weights = factor.preconditioner
@@ -282,8 +282,9 @@ def exhausted():
     short = iterate(max_iterations=3)
     # prepare would refuse this solver at once, so the failure is put where values decide it.
     factor = short.factorize(stepper.operators.problem.matrix, SYSTEM.normals)
-    problem = replace(stepper.operators.problem, factor=factor)
-    return replace(stepper, operators=replace(stepper.operators, problem=problem))
+    form = replace(stepper.operators.problem.form, factor=factor)
+    operators = stepper.operators.changed(lambda _, problem: replace(problem, form=form))
+    return replace(stepper, operators=operators)
 
 
 def test_conjugate_gradient_out_of_iterations_is_an_error():
