@@ -16,7 +16,7 @@ import json
 import math
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,12 +27,19 @@ import optax
 from jax import Array
 
 import jaxcontact as jc
+from jaxcontact.linear.memory import available_memory
 from jaxcontact.optimize import LBFGS, NewtonCG, Optax, SteepestDescent
 from jaxcontact.output.export import write_time_series
 from jaxcontact.output.figures import draw_figures
+from jaxcontact.transforms.files import atomic_write, make_folder
 
 #: Time levels in a time series; longer motions are thinned out to about as many.
 MAX_LEVELS = 150
+
+#: Memory that a node takes at least: rows of four sparse matrices with 14 entries of 8 bytes in
+#: each of two components; and what it takes per step: target, reference, control, gradient,
+#: displacement and velocity, two components of 8 bytes each.
+NODE_BYTES, STEP_BYTES = 4 * 14 * 2 * 8, 6 * 2 * 8
 
 # Words for the command line only; in Python a method is an object.
 METHODS = {
@@ -45,7 +52,7 @@ METHODS = {
 
 @dataclass
 class Output:
-    """The folder of results: every file that is written is reported once."""
+    """The folder of results: every file that was written is reported once."""
 
     folder: Path
     """Where the files go."""
@@ -53,11 +60,13 @@ class Output:
     written: list[str] = field(default_factory=list)
     """Names of the files so far, relative to the folder."""
 
-    def path(self, name: str) -> Path:
-        """Return the path for a file and note it down."""
+    @contextlib.contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """Return the path for a file, and note it down once it is written."""
         path = self.folder / name
-        self.written.append(f"{name} (replaced)" if path.exists() else name)
-        return path
+        note = f"{name} (replaced)" if path.exists() else name
+        yield path
+        self.written.append(note)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; default those of the process.
 
     Returns:
-        0 when everything was done, 1 when a time step could not be solved, 130 after Ctrl-C.
+        0 when everything was done, 1 when a time step could not be solved, a file could not be
+        written or the memory does not hold the problem, 130 after Ctrl-C.
 
     Raises:
         SystemExit: with code 2 and a message on stderr if an argument is wrong.
@@ -76,13 +86,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     output = Output(options.out)
     try:
-        output.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(output.folder)
     except OSError as error:
-        parser.error(f"argument --out: cannot make the folder {options.out}: {error.strerror}")
+        parser.error(f"argument --out: {error}")
     jax.config.update("jax_enable_x64", True)
     try:
+        _check_room(options.h, options.steps)
         return _solve(_problem(parser, options), options, output)
-    except jc.SolveError as error:
+    except (jc.SolveError, OSError, MemoryError) as error:
         print(f"jaxcontact: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -117,6 +128,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _check_room(h: float, steps: int) -> None:
+    """Refuse a problem that the memory cannot hold before its mesh is made.
+
+    Raises:
+        MemoryError: if there is less memory than the problem needs at least.
+    """
+    rings = jc.scenes.RADIUS / h
+    nodes = 1.5 * rings * rings
+    needed, available = nodes * (NODE_BYTES + STEP_BYTES * steps), available_memory()
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"about {nodes:.2g} nodes over {steps} steps need more than {needed / 1e9:.2g} GB of "
+            f"memory, and {available / 1e9:.2g} GB are free; choose a larger --h or fewer --steps"
+        )
+
+
 def _problem(parser: argparse.ArgumentParser, options: argparse.Namespace):
     try:
         return jc.scenes.half_disc_control(options.h, options.steps, options.dt, options.gap)
@@ -130,7 +157,8 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
         f"half disc: {system.n_nodes} nodes, {system.size} unknowns, {len(system.contact_nodes)} "
         f"contact nodes, {problem.steps} steps of {problem.dt:g} s"
     )
-    _write_config(output.path("config.json"), options)
+    with output.writing("config.json") as path:
+        _write_config(path, options)
     has_bar = importlib.util.find_spec("tqdm") is not None
     if not has_bar:
         print("no progress bar; for one: pip install 'jaxcontact[progress]'")
@@ -150,8 +178,10 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
     # Ctrl-C may fall between an iteration and its callback.
     distance = np.full(len(result.history.value), np.nan)
     distance[: len(distances)] = distances
-    _write_history(output.path("history.csv"), result.history, distance)
-    np.savez_compressed(output.path("control.npz"), control=np.asarray(result.control))
+    with output.writing("history.csv") as path:
+        _write_history(path, result.history, distance)
+    with output.writing("control.npz") as path, atomic_write(path, "wb") as file:
+        np.savez_compressed(file, control=np.asarray(result.control))
 
     force = problem.control_scale * result.control
     trajectory = jc.simulate(problem.stepper, force)
@@ -161,8 +191,8 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
     print("\n" + "\n".join(f"  {name:<{width}}  {text}" for name, text in summary.items()))
 
     every = math.ceil(problem.steps / MAX_LEVELS)
-    series = output.path("half-disc.pvd")
-    files = write_time_series(series, problem.scene.mesh, system, trajectory, force, every=every)
+    with output.writing("half-disc.pvd") as path:
+        files = write_time_series(path, problem.scene.mesh, system, trajectory, force, every=every)
     output.written.append(f"half-disc/: {len(files) - 1} VTU files, every {every} steps")
     try:
         figures = draw_figures(problem, result, distance, trajectory, ledger)
@@ -170,7 +200,8 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
         print(f"\nno pictures: {error}")
         figures = {}
     for name, figure in figures.items():
-        figure.savefig(output.path(f"{name}.png"), dpi=150)
+        with output.writing(f"{name}.png") as path, atomic_write(path, "wb") as file:
+            figure.savefig(file, format="png", dpi=150)
     return 130 if result.status is jc.Ending.INTERRUPTED else 0
 
 
@@ -220,12 +251,13 @@ def _write_config(path: Path, options: argparse.Namespace) -> None:
         | {name: importlib.metadata.version(name) for name in packages},
         "backend": jax.default_backend(),
     }
-    path.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    with atomic_write(path, "w") as file:
+        file.write(json.dumps(config, indent=2) + "\n")
 
 
 def _write_history(path: Path, history: jc.History, distance: np.ndarray) -> None:
     columns = (history.value, history.gradient_norm, distance, history.evaluations)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path, "w") as file:
         names = "iteration value gradient_norm distance_to_reference evaluations"
         rows = csv.writer(file)
         rows.writerow(names.split())
@@ -247,7 +279,9 @@ def _not_negative(text: str) -> float:
 
 
 def _count(text: str) -> int:
-    return _checked(text, int, lambda value: value >= 1, "a whole number from 1")
+    most = np.iinfo(np.int32).max
+    wanted = f"a whole number from 1 to {most}"
+    return _checked(text, int, lambda value: 1 <= value <= most, wanted)
 
 
 def _checked(text: str, kind: type, is_valid: Callable[..., bool], wanted: str):

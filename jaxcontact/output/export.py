@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
+from jaxcontact.transforms.files import atomic_write, make_folder
 
 __all__ = ["write_time_series"]
 
@@ -40,7 +41,8 @@ def write_time_series(
     """Write a motion as a time series for ParaView.
 
     Holds afterwards: `path` lists the files `<stem>_<step>.vtu` in the folder `<stem>` beside it
-    with their times. Files of these names are replaced, no other file is touched.
+    with their times. Files of these names are replaced, each as a whole, no other file is touched.
+    The PVD file is the last: it never lists a file that is not there, whenever the writing ends.
 
     Args:
         path: the PVD file to write; its folder is made if there is none.
@@ -56,6 +58,7 @@ def write_time_series(
 
     Raises:
         ValueError: if the path does not end in .pvd, `every` is not positive, or shapes differ.
+        OSError: if a file cannot be written; the message names it.
     """
     path = Path(path)
     if path.suffix != ".pvd":
@@ -76,7 +79,7 @@ def write_time_series(
     fields = _nodal_fields(system, trajectory, control)
     time = np.asarray(trajectory.time)
     folder = path.with_suffix("")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
 
     files, entries = [], []
     for level in [*range(0, steps, every), steps]:
@@ -85,12 +88,12 @@ def write_time_series(
         files.append(file)
         place = quoteattr(f"{folder.name}/{file.name}")
         entries.append(f'    <DataSet timestep="{time[level]:.12g}" part="0" file={place}/>')
-    path.write_text(
-        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-        + "\n".join(entries)
-        + "\n  </Collection>\n</VTKFile>\n",
-        encoding="utf-8",
-    )
+    with atomic_write(path, "w") as pvd:
+        pvd.write(
+            '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
+            + "\n".join(entries)
+            + "\n  </Collection>\n</VTKFile>\n"
+        )
     return [path, *files]
 
 
@@ -136,8 +139,11 @@ def _write_level(file: Path, mesh: Mesh, fields: dict[str, np.ndarray], level: i
     # Here and not above: its import takes longer than that of this package without JAX.
     import meshio
 
-    meshio.Mesh(
+    picture = meshio.Mesh(
         _three_components(np.asarray(mesh.points)),
         [(_CELL_TYPES[mesh.dimension], np.asarray(mesh.cells))],
         point_data={name: series[level] for name, series in fields.items()},
-    ).write(file, file_format="vtu")
+    )
+    with atomic_write(file, "wb") as vtu:
+        # The writer of meshio opens a name, never a file: it gets that of the unfinished file.
+        picture.write(vtu.name, file_format="vtu")

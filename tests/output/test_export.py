@@ -1,3 +1,4 @@
+import os
 import xml.etree.ElementTree as ElementTree
 
 import jax.numpy as jnp
@@ -124,6 +125,54 @@ def test_time_series_leaves_other_files_alone(problem, trajectory, tmp_path):
         tmp_path / "a.pvd", problem.scene.mesh, problem.system, trajectory, every=STEPS
     )
     assert mine.read_text() == "mine"
+
+
+def test_time_series_that_fails_keeps_the_files_that_were_there(tmp_path, monkeypatch):
+    bar = bar_trajectory()
+    files = write_time_series(tmp_path / "a.pvd", *bar)
+    before = {file: file.read_bytes() for file in files}
+    stillborn = tmp_path / "b.pvd"
+    write = meshio.Mesh.write
+
+    def fill_the_disk(picture, name, **options):
+        write(picture, name, **options)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(meshio.Mesh, "write", fill_the_disk)
+    with pytest.raises(OSError, match=r"cannot write .*a_0\.vtu: No space left on device; choose"):
+        write_time_series(tmp_path / "a.pvd", *bar)
+    assert {file: file.read_bytes() for file in files} == before
+    assert sorted(file.name for file in files[1].parent.iterdir()) == [
+        file.name for file in files[1:]
+    ]
+    # A list that was never there is not made before its files.
+    with pytest.raises(OSError, match="No space"):
+        write_time_series(stillborn, *bar)
+    assert not stillborn.exists()
+
+
+def test_time_series_that_cannot_list_its_files_keeps_the_old_list(tmp_path, monkeypatch):
+    bar = bar_trajectory()
+    path = tmp_path / "a.pvd"
+    path.write_text("old")
+    replace = os.replace
+
+    def stop_at_the_list(part, place):
+        if str(place).endswith(".pvd"):
+            raise OSError(28, "No space left on device")
+        replace(part, place)
+
+    monkeypatch.setattr(os, "replace", stop_at_the_list)
+    with pytest.raises(OSError, match=r"cannot write .*a\.pvd: No space"):
+        write_time_series(path, *bar)
+    assert path.read_text() == "old"
+
+
+def test_time_series_whose_folder_is_a_file_says_so(tmp_path):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"cannot make the folder .*a: File exists; choose"):
+        write_time_series(tmp_path / "a.pvd", *bar_trajectory())
+    assert (tmp_path / "a").read_text() == "mine"
 
 
 def test_time_series_refuses_what_does_not_fit(problem, trajectory, tmp_path):

@@ -1,5 +1,6 @@
 import csv
 import json
+import os
 import sys
 import xml.etree.ElementTree as ElementTree
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
+from jaxcontact import cli
 from jaxcontact.cli import METHODS, main
 
 TINY = ["half-disc", "--h", "3.75", "--steps", "12", "--gap", "0.01", "--iterations", "3"]
@@ -131,8 +133,6 @@ def test_half_disc_without_matplotlib_writes_the_rest_and_says_how_to_install_it
 
 
 def test_half_disc_interrupted_writes_what_there_is(tmp_path, monkeypatch, capsys):
-    from jaxcontact import cli
-
     distance, calls = cli._distance, []
 
     def interrupt_second_iteration(*arguments):
@@ -159,6 +159,48 @@ def test_half_disc_unsolved_step_ends_with_its_message(tmp_path, monkeypatch, ca
     assert "step 3 of 12" in capsys.readouterr().err
 
 
+def test_half_disc_on_a_full_disk_ends_with_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "config.json").write_text("old")
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    assert main([*TINY, "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert line.startswith(f"jaxcontact: cannot write {tmp_path}/config.json: No space left on")
+    assert "wrote to" not in said.out
+    assert (tmp_path / "config.json").read_text() == "old"
+
+
+def test_half_disc_whose_file_is_a_folder_ends_with_one_line_and_what_was_written(tmp_path, capsys):
+    (tmp_path / "control.npz").mkdir()
+    assert main([*TINY, "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    # Before it are lines of the progress bar.
+    assert "Traceback" not in said.err
+    assert (
+        said.err.splitlines()[-1]
+        == f"jaxcontact: {tmp_path}/control.npz is a folder; name a file in it"
+    )
+    assert said.out.endswith("  config.json\n  history.csv\n")
+
+
+@pytest.mark.parametrize("large", [["--h", "1e-9"], ["--h", "5e-324"], ["--steps", "1000000000"]])
+def test_half_disc_that_no_memory_holds_ends_with_one_line(large, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "available_memory", lambda: 10**11)
+    assert main(["half-disc", "--out", str(tmp_path), *large]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "GB of memory, and 1e+02 GB are free; choose a larger --h or fewer --steps" in line
+
+
+def test_half_disc_is_not_refused_where_the_memory_is_unknown_or_holds_it(monkeypatch):
+    for free in (None, 3 * 10**7):
+        monkeypatch.setattr(cli, "available_memory", lambda free=free: free)
+        cli._check_room(1.25, 150)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -169,6 +211,7 @@ def test_half_disc_unsolved_step_ends_with_its_message(tmp_path, monkeypatch, ca
         (["--dt", "nan"], "--dt: must be a positive number"),
         (["--gap", "-1"], "--gap: must be zero or a positive number"),
         (["--steps", "1.5"], "--steps: must be a whole number from 1"),
+        (["--steps", "1" + 400 * "0"], "--steps: must be a whole number from 1 to 2147483647"),
         (["--iterations", "0"], "--iterations: must be a whole number from 1"),
         (["--method", "magic"], "invalid choice: 'magic'"),
         (["--method"], "--method: expected one argument"),

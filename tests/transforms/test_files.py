@@ -1,12 +1,13 @@
 """A file is the old one or the new one, never a part of one."""
 
+import errno
 import os
 import subprocess
 import sys
 
 import pytest
 
-from jaxcontact.transforms.files import atomic_write
+from jaxcontact.transforms.files import atomic_write, check_is_file, make_folder
 
 
 def names(folder):
@@ -76,6 +77,62 @@ def test_atomic_write_into_a_pipe_writes_through_it(tmp_path):
     assert pipe.is_fifo()
 
 
-def test_atomic_write_into_no_folder_raises(tmp_path):
-    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "no" / "file", "w"):
+def test_atomic_write_into_no_folder_says_what_to_do(tmp_path):
+    message = "cannot write .*no.file: No such file.*choose a place in a folder that exists"
+    with (
+        pytest.raises(FileNotFoundError, match=message),
+        atomic_write(tmp_path / "no" / "file", "w"),
+    ):
         pass
+
+
+def test_atomic_write_on_a_folder_asks_for_a_file_in_it(tmp_path):
+    message = f"{tmp_path} is a folder; name a file in it"
+    with pytest.raises(IsADirectoryError, match=message), atomic_write(tmp_path, "w"):
+        pass
+    assert names(tmp_path) == []
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_atomic_write_on_a_full_disk_keeps_the_old_file_and_says_so(
+    tmp_path, monkeypatch, function
+):
+    path = tmp_path / "kept"
+    path.write_text("old")
+    monkeypatch.setattr(os, function, full_disk)
+    message = "^cannot write .*kept: No space left on device; choose .* and has room$"
+    with pytest.raises(OSError, match=message) as full, atomic_write(path, "w") as file:
+        file.write("new")
+    assert full.value.errno == errno.ENOSPC
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["kept"]
+
+
+def test_atomic_write_into_a_folder_that_is_read_only_says_so(tmp_path):
+    tmp_path.chmod(0o500)
+    if os.access(tmp_path, os.W_OK):
+        pytest.skip("this user may write everywhere")
+    message = "cannot write .*file: Permission denied; choose"
+    with pytest.raises(PermissionError, match=message), atomic_write(tmp_path / "file", "w"):
+        pass
+
+
+def test_make_folder_where_a_file_is_says_so(tmp_path):
+    make_folder(tmp_path / "a" / "b")
+    make_folder(tmp_path / "a" / "b")
+    (tmp_path / "a" / "b" / "c").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"cannot make the folder .*c: File exists; choose"):
+        make_folder(tmp_path / "a" / "b" / "c")
+
+
+def test_check_is_file_names_what_is_missing_or_a_folder(tmp_path):
+    (tmp_path / "file").write_text("x")
+    check_is_file(tmp_path / "file")
+    with pytest.raises(FileNotFoundError, match=f"no file {tmp_path}/none; check its name"):
+        check_is_file(tmp_path / "none")
+    with pytest.raises(IsADirectoryError, match=f"{tmp_path} is a folder; name a file in it"):
+        check_is_file(tmp_path)
