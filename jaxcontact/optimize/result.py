@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxcontact.optimize.certificate import Stationarity
 from jaxcontact.optimize.method import Ending, MethodState, S
-from jaxcontact.transforms.files import atomic_write
+from jaxcontact.transforms.files import atomic_write, check_is_file
 
 
 @dataclass(frozen=True)
@@ -103,13 +103,14 @@ def load_result(path: str | Path) -> Result:
     """Read a result that `Result.save` wrote; hand it to `optimize` as start to go on.
 
     Raises:
-        OSError: if there is no such file, or it may not be read.
+        OSError: if there is no such file, it is a folder, or it may not be read.
         ValueError: if the file is damaged or holds something else.
     """
+    check_is_file(path)
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             data = {name: arrays[name] for name in arrays.files}
-    except (FileNotFoundError, PermissionError):
+    except PermissionError:
         raise
     # Whatever the readers of zip and npy raise on bytes that they do not expect.
     except Exception as error:

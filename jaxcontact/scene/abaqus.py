@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jaxcontact.transforms.files import check_is_file
+
 if TYPE_CHECKING:
     import meshio
 
@@ -249,7 +251,9 @@ def _lines(path: Path) -> Iterator[str]:
             if not line or line.startswith("**"):
                 continue
             if line.upper().startswith("*INCLUDE"):
-                yield from _lines(path.parent / line.partition("=")[2].strip().strip('"'))
+                included = path.parent / line.partition("=")[2].strip().strip('"')
+                check_is_file(included)
+                yield from _lines(included)
             else:
                 yield line
 

@@ -14,6 +14,7 @@ from jaxcontact.scene.abaqus import read_deck
 from jaxcontact.scene.cells import boundary_facets, cell_volumes
 from jaxcontact.scene.file_groups import SIMPLICES, boundary_groups, cell_groups, node_groups
 from jaxcontact.scene.mesh import Mesh
+from jaxcontact.transforms.files import check_is_file
 
 if TYPE_CHECKING:
     import meshio
@@ -56,7 +57,7 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
         The mesh, in the length unit of the file (the package expects metres).
 
     Raises:
-        OSError: The file cannot be opened.
+        OSError: There is no file, it is a folder, or it cannot be opened.
         ImportError: The format needs another package, as XDMF and MED need h5py.
         ValueError: The file cannot be read as a mesh, has no simplices of this dimension, has other
             cells of this dimension, names nodes that it does not have, lacks the cells of the
@@ -109,6 +110,7 @@ def _read(path: Path) -> meshio.Mesh:
     # Here and not above: its import takes longer than that of this package without JAX.
     import meshio
 
+    check_is_file(path)
     if path.suffix.lower() == ".inp":
         return read_deck(path)
     with path.open("rb"):

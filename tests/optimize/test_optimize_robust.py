@@ -190,11 +190,13 @@ def test_load_result_of_what_is_no_file_of_arrays_says_so(tmp_path):
     (tmp_path / "text.npz").write_text("control")
     np.save(tmp_path / "array.npz.npy", np.zeros(3))
     np.savez(tmp_path / "pickled.npz", control=np.array([{}], dtype=object))
-    for name in (".", "text.npz", "array.npz.npy", "pickled.npz"):
+    for name in ("text.npz", "array.npz.npy", "pickled.npz"):
         with pytest.raises(ValueError, match="cannot be read as a saved result"):
             jc.load_result(tmp_path / name)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*none\.npz; check its name"):
         jc.load_result(tmp_path / "none.npz")
+    with pytest.raises(IsADirectoryError, match="is a folder; name a file in it"):
+        jc.load_result(tmp_path)
 
 
 def test_optimize_refuses_a_saved_state_of_another_shape(saved, problem, tmp_path):

@@ -154,9 +154,9 @@ def test_deck_that_is_refused_says_what_to_do(tmp_path, deck, message):
         read(tmp_path, deck)
 
 
-def test_deck_that_is_missing_is_left_to_oserror(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_mesh(tmp_path / "nothing.inp")
+def test_deck_that_includes_a_missing_file_names_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*nothing\.inc; check its name"):
+        read(tmp_path, "*Include, input=nothing.inc")
 
 
 def test_deck_may_leave_out_zeros_and_have_empty_sections(tmp_path):

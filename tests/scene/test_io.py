@@ -250,9 +250,14 @@ def test_read_mesh_refuses_a_curved_surface(tmp_path):
         read_mesh(path)
 
 
-def test_read_mesh_leaves_a_missing_file_to_oserror(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_mesh(tmp_path / "nothing.msh")
+@pytest.mark.parametrize("ending", ["msh", "inp"])
+def test_read_mesh_of_no_file_or_a_folder_says_so(tmp_path, ending):
+    with pytest.raises(FileNotFoundError, match=rf"there is no file .*nothing\.{ending}; check"):
+        read_mesh(tmp_path / f"nothing.{ending}")
+    folder = tmp_path / f"folder.{ending}"
+    folder.mkdir()
+    with pytest.raises(IsADirectoryError, match="is a folder; name a file in it"):
+        read_mesh(folder)
 
 
 @pytest.mark.parametrize("ending", ["msh", "vtu", "unknown"])
