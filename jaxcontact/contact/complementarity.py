@@ -89,6 +89,10 @@ class ContactSolver(Protocol):
         """Active sets to try where contact cannot be condensed; None if the solver needs W."""
         ...
 
+    def check(self) -> None:
+        """Raise a ValueError if a concrete number that a pytree may not check itself is wrong."""
+        ...
+
     def first_workspace(self, compliance: Array) -> Any:
         """Return what the solver keeps between the steps of W, (C, C); () if nothing."""
         ...

@@ -65,8 +65,10 @@ def contact_form(factor: Factor, contact_solver: ContactSolver) -> ContactForm:
     """Return the form that a factor allows.
 
     Raises:
-        ValueError: if the contact cannot be condensed and the contact solver needs that.
+        ValueError: if the contact cannot be condensed and the contact solver needs that, or a
+            number of the contact solver is out of its range.
     """
+    contact_solver.check()
     if can_condense(factor):
         return CondensedContact(factor, contact_solver)
     max_active_sets = contact_solver.max_active_sets

@@ -57,9 +57,24 @@ class ProjectedGaussSeidel:
 
     is_exact: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        """Check the option, which is never traced.
+
+        Raises:
+            ValueError: if no sweep is allowed.
+        """
+        if self.max_sweeps < 1:
+            raise ValueError(
+                f"ProjectedGaussSeidel.max_sweeps must be 1 or more, got {self.max_sweeps}; leave "
+                "it out for 20000"
+            )
+
     @property
     def max_active_sets(self) -> None:
         """None: it works on the condensed compliance."""
+
+    def check(self) -> None:
+        """Do nothing: what holds no array is checked when it is made."""
 
     def first_workspace(self, compliance: Array) -> tuple[()]:
         """Return (): nothing is kept between steps."""

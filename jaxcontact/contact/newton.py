@@ -60,10 +60,30 @@ class SemismoothNewton:
 
     is_exact: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        """Check the options, which are never traced.
+
+        Raises:
+            ValueError: if no active set is allowed, or a negative number of sweeps.
+        """
+        if self.max_steps < 1:
+            raise ValueError(
+                f"SemismoothNewton.max_steps must be 1 or more, got {self.max_steps}; leave it out "
+                "for 30"
+            )
+        if self.max_sweeps < 0:
+            raise ValueError(
+                f"SemismoothNewton.max_sweeps must not be negative, got {self.max_sweeps}; 0 is "
+                "no sweeps, leave it out for 20000"
+            )
+
     @property
     def max_active_sets(self) -> int:
         """The same number where contact cannot be condensed."""
         return self.max_steps
+
+    def check(self) -> None:
+        """Do nothing: what holds no array is checked when it is made."""
 
     def first_workspace(self, compliance: Array) -> PivotedCompliance:
         """Return the compliance, which each step solves for its active set and hands on."""

@@ -25,6 +25,7 @@ from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxcontact.contact import complementarity
@@ -35,6 +36,7 @@ from jaxcontact.contact.complementarity import (
     separation,
     solve_compliance,
 )
+from jaxcontact.transforms.traced import is_traced, poison_unless
 
 #: Halvings of a Newton step before it is taken anyway.
 MAX_HALVINGS = 12
@@ -77,6 +79,9 @@ class RelaxedContact:
     Of a trajectory of the contact-implicit scheme, lam_i gap_i = 2 tau kappa in every step, i.e.
     (mean contact force) x (gap) = 2 kappa.
 
+    `prepare` and `with_contact` refuse a concrete kappa that is not positive and finite; a traced
+    one ends the step as not finite.
+
     Derivative: forward and reverse mode of every order; kappa counts as constant.
     """
 
@@ -92,6 +97,25 @@ class RelaxedContact:
     def max_active_sets(self) -> None:
         """None: it works on the condensed compliance."""
 
+    def check(self) -> None:
+        """Check what is not traced.
+
+        Raises:
+            ValueError: if kappa is not positive and finite, or no Newton step is allowed.
+        """
+        if not is_traced(self.kappa):
+            kappa = np.asarray(self.kappa)
+            if not np.all(np.isfinite(kappa) & (kappa > 0.0)):
+                raise ValueError(
+                    f"RelaxedContact.kappa must be positive and finite, got {self.kappa}; exact "
+                    "contact is contact_solver=jc.SemismoothNewton()"
+                )
+        if self.max_steps < 1:
+            raise ValueError(
+                f"RelaxedContact.max_steps must be 1 or more, got {self.max_steps}; leave it out "
+                "for 100"
+            )
+
     def first_workspace(self, compliance: Array) -> tuple[()]:
         """Return (): nothing is kept between steps."""
         return ()
@@ -104,6 +128,7 @@ class RelaxedContact:
         closed = guess.active
         diagonal = jnp.diagonal(compliance)
         kappa = jax.lax.stop_gradient(jnp.asarray(self.kappa, offset.dtype))
+        kappa = poison_unless((kappa > 0.0) & (kappa < jnp.inf), kappa)
         scale = jnp.sqrt(diagonal)
 
         def residual(x: Array) -> Array:

@@ -254,3 +254,20 @@ def test_solve_compliance_solves_the_rows_of_the_set(softness):
     block = (compliance + np.diag(soft))[np.ix_(active, active)]
     np.testing.assert_allclose(found[active], np.linalg.solve(block, rhs[active]), rtol=1e-12)
     assert not np.any(np.asarray(found)[~active])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jc.SemismoothNewton(max_steps=0), "max_steps must be 1 or more, got 0"),
+        (lambda: jc.SemismoothNewton(max_sweeps=-1), "max_sweeps must not be negative, got -1"),
+        (lambda: jc.ProjectedGaussSeidel(max_sweeps=0), "max_sweeps must be 1 or more, got 0"),
+    ],
+)
+def test_contact_solver_without_an_iteration_is_refused_when_it_is_made(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_semismooth_newton_may_do_without_sweeps():
+    assert jc.SemismoothNewton(max_steps=1, max_sweeps=0).max_sweeps == 0

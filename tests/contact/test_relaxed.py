@@ -86,11 +86,28 @@ def test_relaxed_contact_without_enough_steps_ends_as_not_converged():
     assert int(solve(1e-3 * size, *data, max_steps=1).status) == jc.Status.NOT_CONVERGED
 
 
-@pytest.mark.parametrize("kappa", [-1.0, 0.0, np.nan])
+@pytest.mark.parametrize("kappa", [-1.0, 0.0, np.nan, np.inf, jnp.float64(0.0)])
 def test_relaxed_contact_with_a_wrong_kappa_raises(kappa):
-    stepper = grazing(contact_solver=jc.RelaxedContact(kappa)).stepper
-    with pytest.raises(jc.SolveError):
-        jc.simulate(stepper, steps=1)
+    solver, message = jc.RelaxedContact(kappa), "kappa must be positive and finite, got .*; exact"
+    with pytest.raises(ValueError, match=message):
+        grazing(contact_solver=solver)
+    with pytest.raises(ValueError, match=message):
+        jc.with_contact(grazing(), solver)
+
+
+def test_relaxed_contact_without_steps_raises():
+    with pytest.raises(ValueError, match=r"RelaxedContact\.max_steps must be 1 or more, got 0"):
+        grazing(contact_solver=jc.RelaxedContact(1.0, 0))
+
+
+def test_relaxed_contact_with_a_wrong_traced_kappa_is_not_a_number():
+    # Far behind the wall: as a closed pair, which alone hides a wrong sign of kappa.
+    data = jnp.array([[2.0]]), jnp.array([-3.0]), jnp.array([True])
+    for kappa in (-1e-3, 0.0, np.nan, np.inf):
+        solution = solve(kappa, *data)
+        assert int(solution.status) == jc.Status.NON_FINITE
+        assert np.isnan(solution.multiplier).all()
+    assert int(solve(1e-3, *data).status) == jc.Status.CONVERGED
 
 
 @pytest.mark.parametrize(
@@ -187,6 +204,5 @@ def test_with_contact_without_a_stepper_raises():
 
 
 def test_relaxed_contact_with_conjugate_gradients_raises():
-    problem = grazing(linear_solver=jc.ConjugateGradient(), contact_solver=jc.RelaxedContact(1.0))
-    with pytest.raises(ValueError, match="RelaxedContact"):
-        jc.simulate(problem.stepper, steps=1)
+    with pytest.raises(ValueError, match=r"RelaxedContact.*prepare with contact_solver="):
+        grazing(linear_solver=jc.ConjugateGradient(), contact_solver=jc.RelaxedContact(1.0))
