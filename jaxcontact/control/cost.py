@@ -21,6 +21,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.control.inner_product import nodal_norms
+from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.sparse import SymmetricMatrix
@@ -82,8 +83,10 @@ class TrackingCost:
 
         Raises:
             ValueError: if the trajectory or the control does not have the T steps of the target,
-                or dt is not that of the trajectory (under jit the value is NaN instead).
+                recorded one by one, or dt is not that of the trajectory (under jit the value is
+                NaN instead).
         """
+        check_every_step(trajectory)
         steps = np.shape(self.target)[0] - 1
         if np.shape(trajectory.displacement) != np.shape(self.target):
             raise ValueError(

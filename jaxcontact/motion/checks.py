@@ -114,6 +114,16 @@ def _check_finite(name: str, value: Array) -> None:
         )
 
 
+def check_every_step(trajectory: Trajectory) -> None:
+    """Raise a ValueError if a trajectory does not hold the state of every step; see `simulate`."""
+    levels, steps = trajectory.displacement.shape[-3], trajectory.contact_impulse.shape[-2]
+    if levels != steps + 1:
+        raise ValueError(
+            f"the trajectory holds {levels} states of {steps} steps, but all {steps + 1} are "
+            "needed here; simulate it with save_every=1"
+        )
+
+
 def raise_if_failed(trajectory: Trajectory) -> None:
     """Raise a `SolveError` if a step of a trajectory with a concrete status was not solved."""
     status = np.asarray(trajectory.status)

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.schemes import Losses, StepState
@@ -71,7 +72,11 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
 
     Returns:
         Energies and flows; the identity of the module docstring holds to rounding.
+
+    Raises:
+        ValueError: if the trajectory was recorded with a save_every other than 1.
     """
+    check_every_step(trajectory)
     system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
     def nothing_yet(record: Array) -> Array:

@@ -29,6 +29,7 @@ from jax.tree_util import Partial
 from jaxcontact.control.bounds import free_variables, mask
 from jaxcontact.control.problem import Problem
 from jaxcontact.derivative.weak import contact_sizes, margins
+from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
 from jaxcontact.motion.trajectory import Trajectory
 
@@ -101,8 +102,7 @@ def certify(
     """
     trajectory = _run(motion, problem.controls, parameters)
     gap, impulse = (np.asarray(x) for x in (trajectory.contact.gap, trajectory.contact.multiplier))
-    if trajectory.gap.shape[0] != gap.shape[0] + 1:
-        raise ValueError("the motion must record every step; simulate it with save_every=1")
+    check_every_step(trajectory)
     sizes = contact_sizes(_stepper_of(motion), trajectory)
     is_weak = margins(trajectory, sizes) <= tolerance
     places = np.argwhere(is_weak)

@@ -19,6 +19,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
@@ -57,9 +58,11 @@ def write_time_series(
         The files: the PVD file, then the VTU files in time order.
 
     Raises:
-        ValueError: if the path does not end in .pvd, `every` is not positive, or shapes differ.
+        ValueError: if the path does not end in .pvd, `every` is not positive, shapes differ, or the
+            trajectory was recorded with a save_every other than 1; `every` thins out.
         OSError: if a file cannot be written; the message names it.
     """
+    check_every_step(trajectory)
     path = Path(path)
     if path.suffix != ".pvd":
         raise ValueError(f"a time series needs a path that ends in .pvd, got {str(path)!r}")

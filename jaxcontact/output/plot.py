@@ -196,7 +196,7 @@ def plot_contact_force(
     if not 1 <= step <= steps:
         raise ValueError(f"step must be one of 1, ..., {steps}, got {step}")
     position, order = _contact_positions(system)
-    force = _contact_force(trajectory)
+    force = np.asarray(trajectory.contact_force)
     ax = make_axes(ax)
     ax.plot(position, force[step - 1, order], marker="o", markersize=4, label=label)
     scale_axis(ax.xaxis, "horizontal position", "m", 1.0)
@@ -220,11 +220,10 @@ def plot_active_set(system: System, trajectory: Trajectory, *, ax: Axes | None =
         position, order = _contact_positions(system)
     else:
         position = order = np.arange(len(system.contact_nodes))
-    force = np.ma.masked_array(_contact_force(trajectory), ~np.asarray(trajectory.active))
+    force = np.ma.masked_array(trajectory.contact_force, ~np.asarray(trajectory.active))
+    time = np.asarray(trajectory.dt) * np.arange(len(force) + 1)
     ax = make_axes(ax)
-    image = ax.pcolormesh(
-        np.asarray(trajectory.time), _cell_edges(position), force[:, order].T, cmap="plasma_r"
-    )
+    image = ax.pcolormesh(time, _cell_edges(position), force[:, order].T, cmap="plasma_r")
     bar = ax.figure.colorbar(image, ax=ax)
     scale_axis(bar.ax.yaxis, "contact force on a node", "N", force.filled(0.0))
     scale_axis(ax.xaxis, "time", "s", trajectory.time)
@@ -282,11 +281,6 @@ def _contact_positions(system: System) -> tuple[np.ndarray, np.ndarray]:
     horizontal = np.asarray(system.points)[system.contact_nodes, 0]
     order = np.argsort(horizontal)
     return horizontal[order], order
-
-
-def _contact_force(trajectory: Trajectory) -> np.ndarray:
-    """Return the mean contact force of each step, (T, C) [N]."""
-    return np.asarray(trajectory.contact_impulse) / np.diff(np.asarray(trajectory.time))[:, None]
 
 
 def _cell_edges(position: np.ndarray) -> np.ndarray:

@@ -38,6 +38,13 @@ def test_tracking_cost_equals_the_formula_of_the_paper(stepper, motion):
     np.testing.assert_allclose(cost(motion, control), expected, rtol=ROUNDING)
 
 
+def test_tracking_cost_of_some_of_the_states_is_refused(stepper):
+    # It would take the time between two records for a step.
+    motion = jc.simulate(stepper, random_control(4), save_every=2)
+    with pytest.raises(ValueError, match=r"3 states of 4 steps.*simulate it with save_every=1"):
+        make_cost(stepper, 0.0 * motion.displacement)(motion)
+
+
 def test_tracking_cost_of_the_target_without_control_is_zero(stepper, motion):
     cost = make_cost(stepper, motion.displacement, control_weight=ALPHA, final_weight=GAMMA)
     assert cost(motion, 0.0 * random_control(STEPS)) == 0.0

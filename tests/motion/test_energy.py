@@ -138,3 +138,10 @@ def test_energy_of_a_batch_equals_the_loop():
     looped = np.stack([lost(control) for control in controls])
     together = jax.vmap(lost)(controls)
     np.testing.assert_allclose(together, looped, atol=1e-10 * np.max(looped))
+
+
+def test_energy_of_some_of_the_states_is_refused():
+    stepper = block()
+    motion = jc.simulate(stepper, steps=STEPS, save_every=2)
+    with pytest.raises(ValueError, match=r"21 states of 40 steps.*simulate it with save_every=1"):
+        jc.energy(stepper, motion)

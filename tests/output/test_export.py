@@ -175,6 +175,13 @@ def test_time_series_whose_folder_is_a_file_says_so(tmp_path):
     assert (tmp_path / "a").read_text() == "mine"
 
 
+def test_time_series_of_some_of_the_states_is_refused(problem, tmp_path):
+    force = problem.control_scale * problem.reference
+    coarse = jc.simulate(problem.stepper, force, save_every=3)
+    with pytest.raises(ValueError, match=r"5 states of 12 steps.*simulate it with save_every=1"):
+        write_time_series(tmp_path / "a.pvd", problem.scene.mesh, problem.system, coarse)
+
+
 def test_time_series_refuses_what_does_not_fit(problem, trajectory, tmp_path):
     mesh, system = problem.scene.mesh, problem.system
     with pytest.raises(ValueError, match=r"ends in \.pvd, got .*\.xdmf"):

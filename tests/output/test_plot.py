@@ -8,6 +8,7 @@ import pytest
 
 import jaxcontact as jc
 from jaxcontact.output import plot
+from jaxcontact.scene.cells import cell_volumes
 
 mpl.use("Agg")
 
@@ -88,7 +89,7 @@ def test_plot_state_error_is_the_l2_norm_of_the_body(problem, trajectory):
     target = trajectory.displacement - jnp.array([3.0, 4.0])[None, None, :]
     ax = plot.plot_state_error(problem.system, trajectory, target)
     mesh = problem.scene.mesh
-    area = np.sum(jc.mesh.cell_volumes(np.asarray(mesh.points), mesh.cells))
+    area = np.sum(cell_volumes(np.asarray(mesh.points), mesh.cells))
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 5.0 * np.sqrt(area), rtol=1e-12)
     assert ax.get_ylabel().endswith("[m$^{2}$]")
 
@@ -162,3 +163,13 @@ def test_import_of_the_package_leaves_matplotlib_and_the_configuration_alone():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_pictures_of_contact_need_no_states_but_those_that_are_recorded(problem, trajectory):
+    force = problem.control_scale * problem.reference
+    coarse = jc.simulate(problem.stepper, force, save_every=3)
+    for draw in (
+        lambda motion: plot.plot_active_set(problem.system, motion).collections[0].get_array(),
+        lambda motion: plot.plot_contact_force(problem.system, motion, STEPS).lines[0].get_ydata(),
+    ):
+        np.testing.assert_allclose(draw(coarse), draw(trajectory), rtol=1e-12)
