@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.control.cost import TrackingCost
+from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper, prepare
 from jaxcontact.scene import meshes
@@ -123,10 +124,15 @@ def half_disc_control(
         final_weight: weight gamma of the final-time observation.
         dtype: floating point type.
         **prepare_options: scheme and solvers, see `prepare`.
+
+    Raises:
+        ValueError: if the motion has no room in the memory, or as `discretize` and `prepare`.
     """
     scene = half_disc(h, gap)
     system = discretize(scene, dtype=dtype)
     stepper = prepare(system, dt, **prepare_options)
+    # Before the reference takes as much.
+    check_run_memory(stepper, steps)
     down = jnp.zeros(system.dimension, dtype).at[-1].set(-1.0)
     reference = jnp.broadcast_to(down, (steps, system.n_nodes, system.dimension))
     return ControlProblem(

@@ -14,6 +14,7 @@ from jax.core import Tracer
 
 from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
 from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed
+from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
@@ -22,6 +23,7 @@ from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
 from jaxcontact.transforms.time_loop import Checkpoint, scan_steps
+from jaxcontact.transforms.traced import is_traced
 
 
 def simulate(
@@ -57,7 +59,8 @@ def simulate(
 
     Raises:
         ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
-            finite, or the initial state penetrates an obstacle or moves a clamped node.
+            finite, the recorded states are more than twice the memory of all devices, or the
+            initial state penetrates an obstacle or moves a clamped node.
         SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
             the trajectory is NaN from that step on instead.
 
@@ -70,6 +73,9 @@ def simulate(
         raise ValueError(
             f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
         )
+    # Under jit the program may be for another machine, and its shapes are those of one of a batch.
+    if not is_traced(stepper):
+        check_run_memory(stepper, steps, save_every=save_every)
     if checkpoint is not None:
         check_option("checkpoint", checkpoint, Checkpoint, "Checkpoint()")
     if weak_contact is not None:

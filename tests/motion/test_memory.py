@@ -164,3 +164,25 @@ def test_check_run_memory_counts_the_states_that_are_recorded(stepper):
 
 def test_check_run_memory_works_while_the_stepper_is_traced(stepper):
     jax.eval_shape(lambda s: check_run_memory(s, 1000), stepper)
+
+
+def test_simulate_refuses_at_once_what_no_machine_holds(stepper, monkeypatch):
+    def compile_or_run(*_):
+        raise AssertionError("the check came too late")
+
+    monkeypatch.setattr("jaxcontact.motion.simulate._run", compile_or_run)
+    with pytest.raises(ValueError, match=r"TB of states.*larger save_every \(now 1\), or simulate"):
+        jc.simulate(stepper, steps=10**12)
+    with pytest.raises(ValueError, match=r"\(now 10\)"):
+        jc.simulate(stepper, steps=10**12, save_every=10)
+
+
+def test_simulate_leaves_the_memory_of_a_traced_stepper_to_whoever_runs_it(stepper):
+    steps = 10**9
+    motion = jax.eval_shape(lambda s: jc.simulate(s, steps=steps), stepper)
+    assert motion.displacement.shape[0] == steps + 1
+
+
+def test_half_disc_control_refuses_at_once_what_no_machine_holds():
+    with pytest.raises(ValueError, match="TB of states"):
+        jc.scenes.half_disc_control(h=7.5, steps=10**11)
