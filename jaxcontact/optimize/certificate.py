@@ -29,7 +29,7 @@ from jax.tree_util import Partial
 from jaxcontact.control.bounds import free_variables, mask
 from jaxcontact.control.problem import Problem
 from jaxcontact.derivative.weak import contact_sizes, margins
-from jaxcontact.motion.checks import check_every_step
+from jaxcontact.motion.checks import check_every_step, raise_if_failed
 from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
 from jaxcontact.motion.trajectory import Trajectory
 
@@ -99,9 +99,11 @@ def certify(
 
     Raises:
         ValueError: if the motion does not record every step or has too many weak pairs.
+        SolveError: if a step of the motion was not solved.
     """
     trajectory = _run(motion, problem.controls, parameters)
     gap, impulse = (np.asarray(x) for x in (trajectory.contact.gap, trajectory.contact.multiplier))
+    raise_if_failed(trajectory)
     check_every_step(trajectory)
     sizes = contact_sizes(_stepper_of(motion), trajectory)
     is_weak = margins(trajectory, sizes) <= tolerance

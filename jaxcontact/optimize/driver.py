@@ -24,6 +24,13 @@ from jaxcontact.system.system import System
 from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
 
+#: Why there is no certificate: the objective is a function alone, or the run did not end by itself.
+NO_MOTION = (
+    "the objective does not tell its motion; hand over a bound method of a pytree with a method "
+    "simulate, or call jc.stationarity with motion="
+)
+UNFINISHED = "the run ended before the certificate; call jc.stationarity"
+
 #: Called with iteration, control, value and gradient norm.
 Callback = Callable[[int, Array, float, float], None]
 
@@ -102,7 +109,8 @@ def optimize(
             (T, N, d), the value and the gradient norm.
 
     Returns:
-        The best control with its value, the history, and why the run ended, see `Ending`.
+        The best control with its value, the history, and why the run ended, see `Ending`; with a
+        certificate of strong stationarity, or why there is none.
 
     Raises:
         ValueError: if the objective is not finite at the start, shapes do not fit, bounds cross,
@@ -133,7 +141,7 @@ def optimize(
     else:
         run = _started(problem, method, start, begin)
 
-    def result(status: Ending, stationarity: Stationarity | None = None) -> Result:
+    def result(status: Ending, certificate: Stationarity | str) -> Result:
         best = run.best
         return Result(
             control=problem.controls(best.parameters),
@@ -141,7 +149,8 @@ def optimize(
             value=float(best.value),
             history=History(*(np.array(column) for column in zip(*run.rows, strict=True))),
             status=status,
-            stationarity=stationarity,
+            stationarity=None if isinstance(certificate, str) else certificate,
+            uncertified=certificate if isinstance(certificate, str) else "",
             method=type(method).__name__,
             state=run.state,
         )
@@ -165,7 +174,7 @@ def optimize(
     except KeyboardInterrupt:
         status = Ending.INTERRUPTED
     except Exception as error:
-        vars(error)["result"] = result(Ending.FAILED)
+        vars(error)["result"] = result(Ending.FAILED, UNFINISHED)
         error.add_note("the optimisation so far is not lost: it is the attribute `result` of this")
         raise
     finally:
@@ -174,7 +183,7 @@ def optimize(
     try:
         return result(status, _certificate(problem, run.best.parameters))
     except KeyboardInterrupt:
-        return result(Ending.INTERRUPTED)
+        return result(Ending.INTERRUPTED, UNFINISHED)
 
 
 def choose_method(method: Method | None) -> Method:
@@ -231,13 +240,15 @@ def _row(problem: Problem, point: Point, begin: float) -> Row:
     )
 
 
-def _certificate(problem: Problem, parameters: Array) -> Stationarity | None:
-    """Return the certificate, or None where there cannot be one: it must not cost the result."""
+def _certificate(problem: Problem, parameters: Array) -> Stationarity | str:
+    """Return the certificate, or why there cannot be one: it must not cost the result."""
     motion = motion_of(problem)
+    if motion is None:
+        return NO_MOTION
     try:
-        return None if motion is None else certify(problem, parameters, motion)
-    except (ValueError, RuntimeError):  # weak contact everywhere, a failed step, no memory left
-        return None
+        return certify(problem, parameters, motion)
+    except (ValueError, RuntimeError) as error:  # weak contact everywhere, a failed step, no memory
+        return str(error) or type(error).__name__
 
 
 def _report(problem: Problem, run: Run, bar: ProgressBar | None, callback: Callback | None) -> None:

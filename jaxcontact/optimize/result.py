@@ -66,7 +66,10 @@ class Result:
     """Why the optimisation ended: text that says what it means and what to do next."""
 
     stationarity: Stationarity | None = None
-    """Certificate of strong stationarity; None if there is none."""
+    """Certificate of strong stationarity; None if there is none, see `uncertified`."""
+
+    uncertified: str = ""
+    """Why there is no certificate and what to do for one; empty if there is one."""
 
     method: str = ""
     """Name of the method."""
@@ -78,8 +81,8 @@ class Result:
     def save(self, path: str | Path) -> None:
         """Write the result to an .npz file, from which `load_result` and `optimize` go on.
 
-        The certificate is not kept. If the writing fails or is killed, a file that was there
-        before is still there.
+        The certificate is not kept, but `uncertified` is. If the writing fails or is killed, a
+        file that was there before is still there.
         """
         data = {f"history_{name}": getattr(self.history, name) for name in COLUMNS}
         for number, leaf in enumerate(jax.tree.leaves(self.state)):
@@ -92,9 +95,13 @@ class Result:
                 value=self.value,
                 status=self.status.name,
                 method=self.method,
+                uncertified=self.uncertified or NOT_KEPT,
                 **data,
             )
 
+
+#: What `uncertified` says of a result that had a certificate before it was saved.
+NOT_KEPT = "a file does not keep the certificate; jc.stationarity makes it anew"
 
 COLUMNS = tuple(column.name for column in fields(History))
 
@@ -146,6 +153,7 @@ def load_result(path: str | Path) -> Result:
         history=history,
         status=Ending[str(data["status"])],
         method=str(data["method"]),
+        uncertified=str(data.get("uncertified", NOT_KEPT)),
         state=[data[name] for name in leaves],
     )
 

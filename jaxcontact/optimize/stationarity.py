@@ -51,7 +51,9 @@ def stationarity(
         The certificate.
 
     Raises:
-        ValueError: if the motion is not known or not recorded in every step.
+        ValueError: if the motion is not known, not recorded in every step, or has more than 500
+            weak pairs.
+        SolveError: if a step of the motion was not solved.
     """
     u = jnp.asarray(u)
     problem = Problem.of(

@@ -1,5 +1,7 @@
 """Interrupts, errors and damaged files do not cost what was computed."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -92,11 +94,19 @@ def test_optimize_interrupted_while_it_checks_a_result_returns_the_result(proble
 
 
 @pytest.mark.parametrize(
-    ("error", "status"),
-    [(KeyboardInterrupt(), jc.Ending.INTERRUPTED), (jc.SolveError(), jc.Ending.STOPPED)],
-    ids=["interrupt", "error"],
+    ("error", "status", "reason"),
+    [
+        (
+            KeyboardInterrupt(),
+            jc.Ending.INTERRUPTED,
+            "before the certificate; call jc.stationarity",
+        ),
+        (jc.SolveError("step 3; reduce dt"), jc.Ending.STOPPED, "step 3; reduce dt"),
+        (RuntimeError(), jc.Ending.STOPPED, "RuntimeError"),
+    ],
+    ids=["interrupt", "error", "silent error"],
 )
-def test_optimize_stopped_in_the_certificate_returns_the_result(monkeypatch, error, status):
+def test_optimize_stopped_in_the_certificate_returns_the_result(monkeypatch, error, status, reason):
     def certify(*_):
         raise error
 
@@ -105,6 +115,7 @@ def test_optimize_stopped_in_the_certificate_returns_the_result(monkeypatch, err
     result = jc.optimize(contact.objective, START, iterations=2, **contact.options)
     assert result.status is status
     assert result.stationarity is None
+    assert result.uncertified.endswith(reason)
     assert result.value == result.history.value[2]
 
 
@@ -121,6 +132,18 @@ def test_save_that_fails_keeps_the_file_that_was_there(whole, tmp_path, monkeypa
         whole.save(path)
     np.testing.assert_array_equal(jc.load_result(path).control, whole.control)
     assert [file.name for file in tmp_path.iterdir()] == ["result.npz"]
+
+
+def test_saved_result_keeps_why_it_has_no_certificate(whole, tmp_path):
+    path = tmp_path / "result.npz"
+    whole.save(path)
+    assert whole.uncertified.startswith("the objective does not tell its motion")
+    assert jc.load_result(path).uncertified == whole.uncertified
+    replace(whole, uncertified="").save(path)
+    lost = "a file does not keep the certificate; jc.stationarity makes it anew"
+    assert jc.load_result(path).uncertified == lost
+    # As of a file that an older version wrote.
+    assert jc.load_result(resaved(path.read_bytes(), path, uncertified=None)).uncertified == lost
 
 
 @pytest.fixture(scope="module")

@@ -109,14 +109,19 @@ def test_stationarity_counts_impulses_in_the_cost():
     np.testing.assert_allclose(certificate.gap_multiplier, [0.0], atol=ROUNDING)
 
 
-def test_stationarity_with_too_many_weak_pairs_raises():
+def touching():
+    """A body that rests on the wall without a force."""
     scene = jc.Scene(
         mesh=jc.meshes.interval(1.0, h=1.0),
         material=jc.KelvinVoigt(young=1.0, poisson=0.0, density=1.0),
         clamped=("left",),
         contact={"right": jc.HalfSpace(point=np.array([1.0]), normal=np.array([-1.0]))},
     )
-    problem = Grazing(jc.prepare(jc.discretize(scene), DT), WALL)
+    return Grazing(jc.prepare(jc.discretize(scene), DT), WALL)
+
+
+def test_stationarity_with_too_many_weak_pairs_raises():
+    problem = touching()
     with pytest.raises(ValueError, match="600 node-steps"):
         jc.stationarity(problem.objective, jnp.zeros((600, 2, 1)), **problem.options)
 
@@ -127,4 +132,19 @@ def test_optimize_reports_stationarity_where_the_objective_tells_its_motion():
     known = jc.optimize(problem.objective, u, iterations=1, **problem.options)
     unknown = jc.optimize(lambda u: jnp.sum(u**2), u, iterations=1, **problem.options)
     assert known.stationarity.residual < ROUNDING
+    assert known.uncertified == ""
     assert unknown.stationarity is None
+    assert "the objective does not tell its motion; hand over a bound method" in repr(unknown)
+
+
+def test_optimize_says_that_too_many_weak_pairs_have_no_certificate():
+    problem = touching()
+    result = jc.optimize(problem.objective, jnp.zeros((600, 2, 1)), iterations=0, **problem.options)
+    assert result.stationarity is None
+    assert "600 node-steps are in weak contact" in result.uncertified
+
+
+def test_stationarity_of_a_motion_with_a_failed_step_raises():
+    problem = grazing()
+    with pytest.raises(jc.SolveError, match=r"step 1 of 2 .* ended as non finite"):
+        jc.stationarity(problem.objective, jnp.full((2, 2, 1), jnp.inf), **problem.options)
