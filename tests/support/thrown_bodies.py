@@ -1,13 +1,14 @@
 """A body thrown at an obstacle, as a function of everything that a scene is made of."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcontact as jc
+from support.bodies import SCHEMES
 
 MESHES = {
     1: jc.meshes.interval(1.0, h=0.125),
@@ -56,7 +57,24 @@ def parameters(dimension, obstacle="plane"):
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), values)
 
 
-def stepper_of(dimension, values, scheme=None):
+def unloaded(dimension, gap, force=0.0, dt=DT, **material):
+    """The values of a body at the distance gap from a plane, under a weight only"""
+    e = up(dimension)
+    usual = {"density": 1.0, "bulk_viscosity": 0.1, "shear_viscosity": 0.1}
+    values = parameters(dimension)
+    changes = {
+        "material": values["material"] | usual | material,
+        "obstacle": {"point": -gap * e, "normal": e},
+        "traction": 0.0 * e,
+        "body_force": -force * e,
+        "dt": dt,
+    }
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), values | changes)
+
+
+@partial(jax.jit, static_argnames=("dimension", "scheme", "dtype"))
+def stepper_of(dimension, values, scheme=None, dtype=jnp.float64):
+    """The stepper, made in one program instead of a hundred small ones"""
     low, top = SIDES[dimension]
     obstacle = values["obstacle"]
     kind = jc.Ball if "radius" in obstacle else jc.HalfSpace
@@ -67,17 +85,20 @@ def stepper_of(dimension, values, scheme=None):
         traction={top: values["traction"]},
         body_force=values["body_force"],
     )
-    return jc.prepare(jc.discretize(scene), values["dt"], scheme=scheme)
+    return jc.prepare(jc.discretize(scene, dtype=dtype), values["dt"], scheme=scheme)
+
+
+def initial_of(values):
+    return jc.State(values["displacement"], values["velocity"])
 
 
 def motion(dimension, values, scheme=None):
     return jc.simulate(
-        stepper_of(dimension, values, scheme),
-        values["control"],
-        initial=jc.State(values["displacement"], values["velocity"]),
+        stepper_of(dimension, values, scheme), values["control"], initial=initial_of(values)
     )
 
 
+@jax.jit
 def cost(trajectory):
     """A cost in which everything enters: states at all times, the end, impulses and gaps"""
     final = trajectory.displacement[-1]
@@ -91,40 +112,43 @@ def cost(trajectory):
     )
 
 
+@partial(jax.jit, static_argnames="weak_contact")
+def value_and_gradient(stepper, control, initial, weak_contact=None):
+    """The cost of a motion and its gradient by control and initial state"""
+
+    def value(control, initial):
+        return cost(jc.simulate(stepper, control, initial=initial, weak_contact=weak_contact))
+
+    return jax.value_and_grad(value, (0, 1))(control, initial)
+
+
 @cache
-def compiled(dimension, scheme=None, obstacle="plane"):
-    """Values, cost and its gradient by all values"""
-    values = parameters(dimension, obstacle)
-
-    def value(values):
-        return cost(motion(dimension, values, scheme))
-
-    return values, jax.jit(value), jax.jit(jax.grad(value))(values)
+def thrown():
+    """Stepper, control and initial state of the plane body: strong contact, and none is weak"""
+    values = parameters(2)
+    return stepper_of(2, values), values["control"], initial_of(values)
 
 
-def grazing(dimension, scheme=None):
+@cache
+def grazing(dimension, scheme=SCHEMES[0]):
     """A motion with one weak contact: stepper, control, initial state, (step, pair)
 
     The body is slowed down and pushed back in free flight. The gap of every pair is set to the
     largest normal displacement of that flight, so that it touches once, without an impulse. With
     `ContactStabilized` it is the predictor y + dt v that touches, the body itself stays open.
     """
-    mesh, e = MESHES[dimension], up(dimension)
+    e, values = up(dimension), unloaded(dimension, gap=10.0)
+    shape = values["points"].shape
     rng = np.random.default_rng(dimension)
-    scene = jc.Scene(
-        mesh,
-        jc.KelvinVoigt(young=100.0, poisson=0.3, bulk_viscosity=0.1, shear_viscosity=0.1),
-        contact={SIDES[dimension][0]: jc.HalfSpace(-10.0 * e, e)},
-    )
-    system = jc.discretize(scene)
-    shape = (mesh.n_nodes, dimension)
     control = jnp.asarray(12.0 * e + 0.3 * rng.normal(size=(STEPS, *shape)))
     initial = jc.State(jnp.zeros(shape), jnp.asarray(np.broadcast_to(-e, shape)))
-    flight = jc.simulate(jc.prepare(system, DT, scheme=scheme), control, initial=initial)
+    stepper = stepper_of(dimension, values, scheme)
+    system = stepper.system
+    flight = jc.simulate(stepper, control, initial=initial)
     reached = flight.displacement[1:]
     if isinstance(scheme, jc.ContactStabilized):
         reached = flight.displacement[:-1] + DT * flight.velocity[:-1]
     normal = np.asarray(jax.vmap(lambda y: system.normals @ y)(system.restrict(reached)))
     place = np.unravel_index(normal.argmax(), normal.shape)
     system = replace(system, gap=jnp.full(normal.shape[1], normal.max()))
-    return jc.prepare(system, DT, scheme=scheme), control, initial, place
+    return replace(stepper, system=system), control, initial, place

@@ -4,11 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.thrown_bodies import cost, grazing, parameters, stepper_of
+from support.thrown_bodies import cost, grazing, thrown, value_and_gradient
 
 import jaxcontact as jc
-
-STEPPER, CONTROL, INITIAL, PLACE = grazing(2)
 
 
 def weighted(trajectory):
@@ -17,7 +15,13 @@ def weighted(trajectory):
 
 
 def simulate(control):
-    return jc.simulate(STEPPER, control, initial=INITIAL)
+    stepper, _, initial, _ = grazing(2)
+    return jc.simulate(stepper, control, initial=initial)
+
+
+def report_at_weak_contact(cost):
+    stepper, control, initial, _ = grazing(2)
+    return jc.derivative_report(stepper, control, cost, initial=initial)
 
 
 def objective(control):
@@ -128,28 +132,24 @@ def test_check_calls_a_gradient_between_the_sides_a_kink():
 
 
 def test_check_says_that_a_kink_is_in_the_cost_if_no_contact_is_weak():
-    values = parameters(2)
-    stepper = stepper_of(2, values)
-    initial = jc.State(values["displacement"], values["velocity"])
+    stepper, control, initial = thrown()
 
     def motion(u):
         return jc.simulate(stepper, u, initial=initial)
 
-    height = motion(values["control"]).displacement[-1, 0, 1]
+    value, (slope, _) = value_and_gradient(stepper, control, initial)
 
     def kinked(u):
-        return jnp.abs(motion(u).displacement[-1, 0, 1] - height)
+        return jnp.abs(cost(motion(u)) - value)
 
-    slope = jax.jit(jax.grad(lambda u: motion(u).displacement[-1, 0, 1]))(values["control"])
-    check = jc.check_gradient(
-        kinked, values["control"], gradient=0.5 * slope, trajectory=motion, directions=0
-    )
+    half = 0.5 * slope
+    check = jc.check_gradient(kinked, control, gradient=half, trajectory=motion, directions=0)
     assert check.verdict.startswith("KINK")
     assert "the kink is in the cost" in check.verdict
 
 
 def test_check_at_weak_contact_finds_the_one_sided_derivative():
-    check = jc.check_gradient(objective, CONTROL, trajectory=simulate, directions=1)
+    check = jc.check_gradient(objective, grazing(2)[1], trajectory=simulate, directions=1)
     assert check.weak_contacts == 1
     assert check.contact_changes == 1
     assert check.verdict.startswith("ONE-SIDED")
@@ -163,9 +163,9 @@ def test_check_of_a_vector_is_refused():
 
 
 def test_report_at_weak_contact_locates_it():
-    report = jc.derivative_report(STEPPER, CONTROL, weighted, initial=INITIAL)
-    step, pair = PLACE
-    np.testing.assert_array_equal(report.weak, [[step, STEPPER.system.contact_nodes[pair]]])
+    report = report_at_weak_contact(weighted)
+    stepper, _, _, (step, pair) = grazing(2)
+    np.testing.assert_array_equal(report.weak, [[step, stepper.system.contact_nodes[pair]]])
     assert not report.is_differentiable
     assert report.margin == 0.0
     assert report.forward_residual <= 1e-11
@@ -175,12 +175,12 @@ def test_report_at_weak_contact_locates_it():
 
 @pytest.mark.parametrize("factor", [1.0, -1.0])
 @pytest.mark.parametrize(
-    "problem",
-    [grazing(2), grazing(2, jc.ContactStabilized())],
+    "scheme",
+    [jc.ContactImplicit(), jc.ContactStabilized()],
     ids=["end of the step", "predictor"],
 )
-def test_report_signs_tell_a_valley_from_a_ridge(factor, problem):
-    stepper, control, initial, _ = problem
+def test_report_signs_tell_a_valley_from_a_ridge(factor, scheme):
+    stepper, control, initial, _ = grazing(2, scheme)
 
     def signed(trajectory):
         return factor * weighted(trajectory)
@@ -190,12 +190,8 @@ def test_report_signs_tell_a_valley_from_a_ridge(factor, problem):
     direction = jnp.asarray(np.random.default_rng(0).normal(size=control.shape))
 
     def one_sided(sign):
-        choice = jc.CriticalCone()
-
-        def value(u):
-            return signed(jc.simulate(stepper, u, initial=initial, weak_contact=choice))
-
-        return float(jax.jvp(value, (control,), (sign * direction,))[1])
+        tangent = jc.directional_derivative(stepper, control, sign * direction, initial=initial)
+        return float(signed(tangent))  # the cost is linear
 
     # J'(d) + J'(-d) is positive across a valley.
     is_valley = one_sided(1.0) + one_sided(-1.0) > 0.0
@@ -207,7 +203,7 @@ def test_report_of_a_nan_cost_says_so():
     def broken(trajectory):
         return jnp.sqrt(-jnp.sum(trajectory.velocity**2))
 
-    report = jc.derivative_report(STEPPER, CONTROL, broken, initial=INITIAL)
+    report = report_at_weak_contact(broken)
     assert str(report).startswith("NOT FINITE")
 
 
@@ -226,22 +222,23 @@ def test_report_of_modes_that_differ_says_wrong():
         )
     )
 
-    report = jc.derivative_report(STEPPER, CONTROL, lambda t: halved(weighted(t)), initial=INITIAL)
+    report = report_at_weak_contact(lambda trajectory: halved(weighted(trajectory)))
     assert "WRONG" in str(report)
 
 
 def test_report_away_from_weak_contact_measures_the_margin():
-    values = parameters(2)
-    initial = jc.State(values["displacement"], values["velocity"])
-    stepper = stepper_of(2, values)
-    report = jc.derivative_report(stepper, values["control"], cost, initial=initial)
-    trajectory = jc.simulate(stepper, values["control"], initial=initial)
-    gap, impulse = np.asarray(trajectory.gap[1:]), np.asarray(trajectory.contact_impulse)
-    margins = np.maximum(gap / gap.max(), impulse / impulse.max())
+    stepper, control, initial = thrown()
+    report = jc.derivative_report(stepper, control, weighted, initial=initial)
+    trajectory = jc.simulate(stepper, control, initial=initial)
+    # The multiplier is half the impulse; its size is at least the momentum of the heaviest node.
+    gap, multiplier = np.asarray(trajectory.gap), np.asarray(trajectory.contact_impulse) / 2
+    momentum = stepper.system.mass.to_scipy().diagonal().max() * np.abs(trajectory.velocity).max()
+    size = max(multiplier.max(), momentum)
+    margins = np.maximum(gap[1:] / gap.max(), multiplier / size)
     assert report.is_differentiable
     assert report.margin == pytest.approx(margins.min())
     assert report.duality_gap <= 1e-13
     wide = jc.derivative_report(
-        stepper, values["control"], cost, initial=initial, tolerance=1.01 * report.margin
+        stepper, control, weighted, initial=initial, tolerance=1.01 * report.margin
     )
     assert len(wide.nearly_weak) == 1
