@@ -49,7 +49,7 @@ def moments(system, matrix, body):
 @pytest.mark.parametrize("sets", [("left/bottom", "right/bottom"), ("right/bottom",)])
 def test_redistributed_mass_keeps_mass_centre_and_inertia_of_each_body(sets):
     scene = two_bodies(sets)
-    system = jc.discretize(scene)
+    system = bodies.discretized(scene)
     moved = redistribute(system).to_symmetric(system.n_nodes).to_scipy().toarray()
     labels = scene.mesh.components()
     assert labels.max() == 1
@@ -61,7 +61,7 @@ def test_redistributed_mass_keeps_mass_centre_and_inertia_of_each_body(sets):
 
 def test_redistributed_mass_moves_nothing_between_bodies():
     scene = two_bodies()
-    system = jc.discretize(scene)
+    system = bodies.discretized(scene)
     moved = redistribute(system).to_symmetric(system.n_nodes).to_scipy().toarray()
     first = np.repeat(scene.mesh.components() == 0, 2)
     np.testing.assert_array_equal(moved[first][:, ~first], 0.0)
@@ -76,6 +76,6 @@ def test_redistributed_mass_of_two_bodies_is_traceable():
         moved = jc.Scene(mesh.with_points(scale * mesh.points), scene.material, (), scene.contact)
         return redistribute(jc.discretize(moved)).blocks
 
-    expected = redistribute(jc.discretize(two_bodies())).blocks
+    expected = redistribute(bodies.discretized(two_bodies())).blocks
     scale = np.max(np.abs(expected))
     np.testing.assert_allclose(entries(1.0), expected, atol=ROUNDING * scale)

@@ -1,5 +1,9 @@
 """Small bodies that several test modules throw at obstacles."""
 
+from dataclasses import replace
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,10 +32,33 @@ def block_scene(material=VISCOUS, *, gap=0.1, normal=(0.0, 1.0), force=(0.0, -10
     return jc.Scene(mesh, material, contact={"bottom": plane}, body_force=jnp.asarray(force))
 
 
-def block(material=VISCOUS, *, dt=DT, contact_solver=None, dtype=jnp.float64, **scene):
+def discretized(scene):
+    """The system of a scene, made in one program instead of a hundred small ones"""
+    return jax.jit(lambda: jc.discretize(scene))()
+
+
+def block(
+    material=VISCOUS,
+    *,
+    gap=0.1,
+    normal=(0.0, 1.0),
+    force=(0.0, -10.0),
+    dt=DT,
+    contact_solver=None,
+    dtype=jnp.float64,
+):
     """The prepared block"""
-    system = jc.discretize(block_scene(material, **scene), dtype=dtype)
-    return jc.prepare(system, dt, contact_solver=contact_solver)
+    is_elastic = material.bulk_viscosity == material.shear_viscosity == 0.0
+    return _prepare(material, gap, normal, force, dt, is_elastic, contact_solver, dtype)
+
+
+# One program for all values of the scene.
+@partial(jax.jit, static_argnums=(5, 6, 7))
+def _prepare(material, gap, normal, force, dt, is_elastic, contact_solver, dtype):
+    if is_elastic:  # not traced, so that there is no matrix of viscosity
+        material = replace(material, bulk_viscosity=0.0, shear_viscosity=0.0)
+    scene = block_scene(material, gap=gap, normal=normal, force=force)
+    return jc.prepare(jc.discretize(scene, dtype=dtype), dt, contact_solver=contact_solver)
 
 
 def random_control(steps, seed=0, size=10.0):
