@@ -12,6 +12,7 @@ With a load f_i = L_11 u_i on the free node that is u = psi c / (L_11 c.c), inde
 """
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -46,13 +47,19 @@ class Grazing:
 
 def grazing(target=0.15, dtype=jnp.float64, **options):
     """The problem; targets beyond the wall put the minimiser on the kink."""
+    return Grazing(_prepare(dtype, **options), target)
+
+
+@cache
+def _prepare(dtype, **options):
     scene = jc.Scene(
         mesh=jc.meshes.interval(1.0, h=1.0),
         material=jc.KelvinVoigt(young=4.0, poisson=0.0, density=3.0),
         clamped=("left",),
         contact={"right": jc.HalfSpace(point=np.array([1.0 + WALL]), normal=np.array([-1.0]))},
     )
-    return Grazing(jc.prepare(jc.discretize(scene, dtype=dtype), DT, **options), target)
+    # One program instead of a hundred small ones.
+    return jax.jit(lambda: jc.prepare(jc.discretize(scene, dtype=dtype), DT, **options))()
 
 
 def influence(problem):
