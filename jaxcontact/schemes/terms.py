@@ -27,7 +27,9 @@ def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:
         y: displacement at the start of the step, (n,) [m].
         v: velocity at the start of the step, (n,) [m/s]; it bounds the rounding of the free motion.
     """
-    resolution = gap_resolution(system, y) / dt + _rounding(system, v)
+    # One reduction over n for both: small kernels are what a step of a small body consists of.
+    largest = jnp.max(jnp.maximum(jnp.abs(y) / dt, jnp.abs(v)), initial=0.0)
+    resolution = _gap_resolution(system, y, dt * largest) / dt
     return Bound((system.gap - system.normals @ y) / dt, resolution)
 
 
@@ -37,16 +39,15 @@ def gap_resolution(system: System, y: Array) -> Array:
     A smaller gap is closed. The geometry has the error of its positions, and the free motion that
     of A y, whose terms cancel: tau N D^-1 (tau A y) is at most some max |y|, for every tau.
     """
-    local = jnp.sum(jnp.abs(system.normals.weights * y[system.normals.unknowns]), axis=1)
-    local = jax.lax.stop_gradient(4.0 * jnp.finfo(y.dtype).eps * local)
-    return jax.lax.stop_gradient(system.gap_rounding) + local + _rounding(system, y)
+    return _gap_resolution(system, y, jnp.max(jnp.abs(y), initial=0.0))
 
 
-def _rounding(system: System, x: Array) -> Array:
-    """Return the rounding error of N x' for an x' that is made of terms as large as x, (C,)."""
-    largest = jnp.max(jnp.abs(system.normals.weights), axis=1, initial=0.0)
-    size = largest * jnp.max(jnp.abs(x), initial=0.0)
-    return jax.lax.stop_gradient(4.0 * jnp.finfo(x.dtype).eps * size)
+def _gap_resolution(system: System, y: Array, largest: Array) -> Array:
+    """Return the resolution for terms of the free motion as large as a displacement, (C,)."""
+    weights = jnp.abs(system.normals.weights)
+    size = jnp.sum(weights * (jnp.abs(y[system.normals.unknowns]) + largest), axis=1)
+    rounding = system.gap_rounding + 4.0 * jnp.finfo(y.dtype).eps * size
+    return jax.lax.stop_gradient(rounding)
 
 
 def viscous_loss(system: System, dt: Array, increment: Array) -> Array:

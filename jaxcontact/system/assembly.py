@@ -13,12 +13,17 @@ comments: e cell, a b local node, i j component.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jax import Array
+
+from jaxcontact.scene.material import KelvinVoigt, is_admissible
+from jaxcontact.transforms.traced import poison_unless
 
 
 class NodePattern(NamedTuple):
@@ -129,3 +134,67 @@ def nodal_areas(points: Array, facets: Array | np.ndarray) -> Array:
         areas = jnp.sqrt(jnp.linalg.det(gram)) / float(np.prod(np.arange(1, dimension)))
     shares = jnp.repeat(areas / dimension, dimension)
     return jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(facets)].add(shares)
+
+
+class SceneValues(NamedTuple):
+    """Entries of the matrices in ELL layout, those of the masses scalar; nodal load (N, d)."""
+
+    mass: Array
+    stiffness: Array
+    viscosity: Array | None
+    l2_mass: Array
+    nodal_mass: Array
+    load: Array
+
+
+# One program for all of it: compiling operation by operation takes seconds for every new mesh.
+@partial(jax.jit, static_argnames="is_elastic")
+def scene_values(
+    points: Array,
+    cells: Array,
+    material: KelvinVoigt,
+    pattern: NodePattern,
+    all_nodes: NodePattern,
+    body_force: Array | None,
+    tractions: dict[str, tuple[Array, Array]],
+    *,
+    is_elastic: bool,
+) -> SceneValues:
+    """Return the entries of all matrices of a scene, and its constant load.
+
+    Args:
+        points: node positions, (N, d) [m].
+        cells: connectivity, (E, d+1).
+        material: scalars, or one value per cell (E,).
+        pattern: sparsity on the free nodes.
+        all_nodes: sparsity on all nodes.
+        body_force: (d,) [N/m^d], or None.
+        tractions: facets (F, d) and traction (d,) [N/m^(d-1)] of each loaded set.
+        is_elastic: whether there is no viscosity.
+    """
+    dimension = points.shape[1]
+    gradients, volumes = hat_gradients(points, cells)
+    l2_blocks = mass_blocks(volumes, dimension)
+    density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
+
+    def isotropic(lame: tuple) -> Array:
+        blocks = stiffness_blocks(gradients, volumes, lame)
+        return assemble(pattern, blocks)
+
+    load = jnp.zeros(points.shape, points.dtype)
+    if body_force is not None:
+        shares = jnp.repeat(volumes / (dimension + 1), dimension + 1)
+        weights = jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(cells)].add(shares)
+        load = load + weights[:, None] * body_force[None, :]
+    for facets, traction in tractions.values():
+        load = load + nodal_areas(points, facets)[:, None] * traction[None, :]
+    values = SceneValues(
+        mass=assemble(pattern, density[:, None, None, None, None] * l2_blocks),
+        stiffness=isotropic(material.elastic_lame()),
+        viscosity=None if is_elastic else isotropic(material.viscous_lame()),
+        l2_mass=assemble(pattern, l2_blocks),
+        nodal_mass=assemble(all_nodes, l2_blocks),
+        load=load,
+    )
+    # Concrete values were checked before; traced ones cannot raise.
+    return poison_unless(is_admissible(material) & jnp.all(volumes > 0.0), values)

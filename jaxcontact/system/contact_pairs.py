@@ -39,18 +39,25 @@ class ContactPairs(NamedTuple):
     area: Array
     """Integral of the hat function of the node over its contact set, (C,) [m^(d-1)]."""
 
+    rounding: Array
+    """Rounding error of the gap that the positions of node and obstacle bring, (C,) [m]."""
+
 
 def contact_pairs(scene: Scene, points: Array) -> ContactPairs:
     """Return the contact pairs of the node positions (N, d)."""
     sets = _merge_sets(scene)
     if not sets:
         nothing = jnp.zeros(0, points.dtype)
-        return ContactPairs(np.zeros(0, np.int32), nothing, points[:0], nothing)
+        return ContactPairs(np.zeros(0, np.int32), nothing, points[:0], nothing, nothing)
     parts = []
     for obstacle, facets in sets:
         nodes = np.unique(facets).astype(np.int32)
         gap, normals = gap_and_normals(obstacle, points[nodes])
-        parts.append(ContactPairs(nodes, gap, normals, nodal_areas(points, facets)[nodes]))
+        places = jnp.sum(jnp.abs(normals * points[nodes]), axis=1)
+        rounding = jnp.finfo(points.dtype).eps * places
+        parts.append(
+            ContactPairs(nodes, gap, normals, nodal_areas(points, facets)[nodes], rounding)
+        )
     nodes, *values = zip(*parts, strict=True)
     pairs = ContactPairs(np.concatenate(nodes), *map(jnp.concatenate, values))
     if is_traced((pairs.gap, pairs.normals)):
@@ -115,4 +122,5 @@ def _drop_twins(
                     union = np.unique(np.concatenate([facets[k] for k in joined]), axis=0)
                     areas[joined] = np.asarray(nodal_areas(points, union))
                 area[kept] = areas[joined][node]
-    return ContactPairs(pairs.nodes[keep], *(jnp.asarray(x[keep]) for x in (gap, normals, area)))
+    values = (gap, normals, area, np.asarray(pairs.rounding))
+    return ContactPairs(pairs.nodes[keep], *(jnp.asarray(x[keep]) for x in values))

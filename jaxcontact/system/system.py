@@ -8,8 +8,6 @@ on the n unknowns: the displacement components of the nodes that are not clamped
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +15,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.material import KelvinVoigt, is_admissible
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.system import assembly
 from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
-from jaxcontact.transforms.traced import as_array, poison_unless
+from jaxcontact.transforms.traced import as_array
 
 
 @jax.tree_util.register_dataclass
@@ -185,7 +182,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
 
     pattern = assembly.node_pattern(cells, numbers)
     all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
-    values = _assemble(
+    values = assembly.scene_values(
         points,
         cells,
         cellwise_material(scene),
@@ -197,9 +194,9 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     )
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
-        pairs = contact_pairs(scene, jnp.asarray(mesh.points, dtype))
-    places = jnp.abs(pairs.normals * points[pairs.nodes]).sum(axis=1)
-    rounding = 4.0 * jnp.finfo(dtype).eps * jax.lax.stop_gradient(places + jnp.abs(pairs.gap))
+        # In the digits of the mesh: a gap is a small difference of large positions.
+        pairs = contact_pairs(scene, jnp.asarray(mesh.points))
+    rounding = pairs.rounding + 4.0 * jnp.finfo(dtype).eps * jnp.abs(pairs.gap)
     components = np.arange(dimension, dtype=np.int32)
     unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
@@ -212,69 +209,17 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(pairs.normals, unknowns, dimension * free_nodes.size),
-        gap=pairs.gap,
-        gap_rounding=rounding,
+        normals=ContactNormals(pairs.normals.astype(dtype), unknowns, dimension * free_nodes.size),
+        gap=pairs.gap.astype(dtype),
+        gap_rounding=jax.lax.stop_gradient(rounding).astype(dtype),
         load=values.load[free_nodes].reshape(-1),
         contact_nodes=pairs.nodes,
-        contact_area=pairs.area,
+        contact_area=pairs.area.astype(dtype),
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
         dimension=dimension,
     )
-
-
-class _Values(NamedTuple):
-    """Entries of the matrices in ELL layout, those of the masses scalar; nodal load (N, d)."""
-
-    mass: Array
-    stiffness: Array
-    viscosity: Array | None
-    l2_mass: Array
-    nodal_mass: Array
-    load: Array
-
-
-# One program for all of it: compiling operation by operation takes seconds for every new mesh.
-@partial(jax.jit, static_argnames="is_elastic")
-def _assemble(
-    points: Array,
-    cells: Array,
-    material: KelvinVoigt,
-    pattern: assembly.NodePattern,
-    all_nodes: assembly.NodePattern,
-    body_force: Array | None,
-    tractions: dict[str, tuple[Array, Array]],
-    *,
-    is_elastic: bool,
-) -> _Values:
-    dimension = points.shape[1]
-    gradients, volumes = assembly.hat_gradients(points, cells)
-    l2_blocks = assembly.mass_blocks(volumes, dimension)
-    density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
-
-    def isotropic(lame: tuple) -> Array:
-        blocks = assembly.stiffness_blocks(gradients, volumes, lame)
-        return assembly.assemble(pattern, blocks)
-
-    load = jnp.zeros(points.shape, points.dtype)
-    if body_force is not None:
-        shares = jnp.repeat(volumes / (dimension + 1), dimension + 1)
-        weights = jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(cells)].add(shares)
-        load = load + weights[:, None] * body_force[None, :]
-    for facets, traction in tractions.values():
-        load = load + assembly.nodal_areas(points, facets)[:, None] * traction[None, :]
-    values = _Values(
-        mass=assembly.assemble(pattern, density[:, None, None, None, None] * l2_blocks),
-        stiffness=isotropic(material.elastic_lame()),
-        viscosity=None if is_elastic else isotropic(material.viscous_lame()),
-        l2_mass=assembly.assemble(pattern, l2_blocks),
-        nodal_mass=assembly.assemble(all_nodes, l2_blocks),
-        load=load,
-    )
-    # Concrete values were checked before; traced ones cannot raise.
-    return poison_unless(is_admissible(material) & jnp.all(volumes > 0.0), values)
 
 
 def _check_dtype(dtype) -> None:
