@@ -157,7 +157,9 @@ def solve_compliance(compliance: Array, active: Array, softness: Array | None, r
     matrix = jnp.where(inside, compliance, 0.0) * scale[:, None] * scale[None, :]
     matrix = matrix + jnp.diag(diagonal.astype(compliance.dtype) * scale**2)
     shift = rank_shift(compliance)
-    factor = jax.scipy.linalg.cho_factor(matrix + shift * jnp.eye(len(scale)), lower=True)
+    factor = jax.scipy.linalg.cho_factor(
+        matrix + shift * jnp.eye(scale.size, dtype=scale.dtype), lower=True
+    )
     solution = jnp.zeros_like(rhs)
     # The last two passes take the shift out again.
     for _ in range(3):

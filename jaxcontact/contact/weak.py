@@ -12,7 +12,7 @@ it. They differ at weak contact only. Source: paper, Theorem 4.20 and section 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import jax
 from jax import Array
@@ -86,8 +86,8 @@ class AlongDirection:
     The gradient g is linear, and g . direction is the exact one-sided derivative.
     """
 
-    control: Any = None
+    control: Array | None = None
     """Direction of the control, (T, N, d) [N/m^d]; None is zero."""
 
-    initial: Any = None
+    initial: object = None
     """Direction of the initial state, a `State`; None is zero."""

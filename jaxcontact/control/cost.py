@@ -12,8 +12,6 @@ of the trajectory, and so is any other JAX function of it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,7 +130,9 @@ def _tracking_cost(
     return cost
 
 
-def _observation(system: System, facets: Any, nodes: Any) -> Array | None:
+def _observation(
+    system: System, facets: np.ndarray | None, nodes: np.ndarray | None
+) -> Array | None:
     """Return the weight of each node, (N,); None is the L2 norm of the body."""
     if facets is None and nodes is None:
         return None

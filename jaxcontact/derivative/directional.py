@@ -12,7 +12,6 @@ the direction if and only if no step has weak contact. Source: paper, Theorem 4.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +37,7 @@ def directional_derivative(
     steps: int | None = None,
     initial: State | None = None,
     initial_direction: State | None = None,
-    stepper_direction: Any = None,
+    stepper_direction: Stepper | None = None,
 ) -> Trajectory:
     """Return the one-sided derivative of the motion along a direction.
 

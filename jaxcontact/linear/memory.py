@@ -2,7 +2,7 @@
 
 Memory that caches hold counts as free, and the limit of a control group (a container, a batch job)
 counts where it is lower than what the machine has.
-Source: the kernel's documentation of /proc/meminfo, cgroup v1 `memory` and cgroup v2.
+Source: the Linux kernel documentation (2024) of /proc/meminfo, cgroup v1 `memory` and cgroup v2.
 """
 
 from __future__ import annotations

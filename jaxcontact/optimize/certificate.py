@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -219,7 +218,7 @@ def _is_stepper(node: object) -> bool:
 
 
 @jax.jit
-def _run(motion: Any, controls: Any, parameters: Array) -> Trajectory:
+def _run(motion: Callable, controls: Callable, parameters: Array) -> Trajectory:
     return motion(controls(parameters))
 
 

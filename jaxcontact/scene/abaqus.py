@@ -1,8 +1,8 @@
 """Abaqus decks: nodes, linear simplices, and the sets and surfaces that name them.
 
 Own code because meshio knows few element types (not CPE3), no surfaces, and names the wrong cells
-where a block of elements has no set. Source: Abaqus Analysis User's Guide, 2.2 (nodes, elements,
-sets, surfaces) and 28.1 (faces of elements).
+where a block of elements has no set. Source: Abaqus Analysis User's Guide (2016), 2.2 (nodes,
+elements, sets, surfaces) and 28.1 (faces of elements).
 """
 
 from __future__ import annotations

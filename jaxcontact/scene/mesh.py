@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
@@ -35,7 +36,7 @@ __all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
 class Mesh:
     """Simplicial mesh with named facet sets and regions; build it with `from_arrays`."""
 
-    points: Any
+    points: Array | np.ndarray
     """Node positions, (N,d) [m]: float64 NumPy, or the JAX array that was given."""
     cells: np.ndarray
     """Node indices of the positively oriented cells, (E,d+1) int32."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from jaxcontact.scene.material import KelvinVoigt, check_material
 from jaxcontact.scene.mesh import Mesh
@@ -102,7 +102,7 @@ def is_elastic(scene: Scene) -> bool:
     return all(material.is_elastic() for material in scene.material.values())
 
 
-def _check_vector(name: str, vector: Any, dimension: int) -> None:
+def _check_vector(name: str, vector: ArrayLike, dimension: int) -> None:
     vector = as_array(vector)
     if vector.shape != (dimension,):
         raise ValueError(f"{name} must have shape ({dimension},), got {vector.shape}")

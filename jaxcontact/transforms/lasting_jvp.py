@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.core import ShapedArray
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
@@ -51,7 +52,7 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
     return call
 
 
-def _flat(leaves: tuple, function: Callable, tree: Any) -> list:
+def _flat(leaves: tuple, function: Callable, tree) -> list:
     return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
 
 
@@ -62,7 +63,9 @@ def _mapped(function: Callable, axes: tuple) -> Callable:
     return function
 
 
-def _evaluate(*leaves: Any, function: Callable, rule: Callable, tree: Any, axes: tuple) -> list:
+def _evaluate(
+    *leaves: Array, function: Callable, rule: Callable, tree: object, axes: tuple
+) -> list:
     del rule
     return _mapped(lambda *x: _flat(x, function, tree), axes)(*leaves)
 
@@ -102,11 +105,11 @@ def _batch(leaves, axes_of_leaves, *, axes, **options):
     return results, [0] * len(results)
 
 
-def _zero(x: Any) -> ad.Zero:
+def _zero(x: Array) -> ad.Zero:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
-def _is_float(x: Any) -> bool:
+def _is_float(x: Array) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 

@@ -13,13 +13,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
+State = TypeVar("State")
+Inputs = TypeVar("Inputs")
+Record = TypeVar("Record")
+Tree = TypeVar("Tree")
 #: Maps (state, input of one step) to (state, record of the step).
-Step = Callable[[Any, Any], tuple[Any, Any]]
+Step = Callable[[State, Inputs], tuple[State, Record]]
 
 
 @dataclass(frozen=True)
@@ -48,13 +52,13 @@ class Checkpoint:
 
 
 def scan_steps(
-    step: Step,
-    start: Any,
-    inputs: Any,
+    step: Step[State, Inputs, Record],
+    start: State,
+    inputs: Inputs,
     steps: int,
     save_every: int = 1,
     checkpoint: Checkpoint | None = None,
-) -> tuple[Any, Any]:
+) -> tuple[State, Record]:
     """Scan over the steps.
 
     Args:
@@ -70,11 +74,11 @@ def scan_steps(
         (T, ...).
     """
 
-    def block(state: Any, block_inputs: Any) -> tuple[Any, tuple[Any, Any]]:
+    def block(state: State, block_inputs: Inputs) -> tuple[State, tuple[State, Record]]:
         state, records = jax.lax.scan(step, state, block_inputs, length=save_every)
         return state, (state, records)
 
-    def single(state: Any, step_input: Any) -> tuple[Any, tuple[Any, Any]]:
+    def single(state: State, step_input: Inputs) -> tuple[State, tuple[State, Record]]:
         state, record = step(state, step_input)
         return state, (state, record)
 
@@ -91,14 +95,14 @@ def scan_steps(
 
 
 def _scan_segments(
-    scan_blocks: Callable, start: Any, inputs: Any, n_blocks: int, length: int
-) -> tuple[Any, Any]:
+    scan_blocks: Callable, start: object, inputs: object, n_blocks: int, length: int
+) -> tuple:
     """Scan over checkpointed segments of equal length and a shorter last one."""
     n_whole = n_blocks // length
     n_inside = n_whole * length
 
     @partial(jax.checkpoint, prevent_cse=False, static_argnums=2)  # type: ignore
-    def segment(state: Any, segment_inputs: Any, n: int) -> tuple[Any, Any]:
+    def segment(state: object, segment_inputs: object, n: int) -> tuple:
         return scan_blocks(state, segment_inputs, length=n)
 
     whole = jax.tree.map(lambda x: x[:n_inside], inputs)
@@ -113,11 +117,11 @@ def _scan_segments(
     return recorded
 
 
-def _split(tree: Any, n: int) -> Any:
+def _split(tree: Tree, n: int) -> Tree:
     """Return leaves (n m, ...) as (n, m, ...)."""
     return jax.tree.map(lambda x: x.reshape(n, -1, *x.shape[1:]), tree)
 
 
-def _join(tree: Any) -> Any:
+def _join(tree: Tree) -> Tree:
     """Return leaves (n, m, ...) as (n m, ...)."""
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)

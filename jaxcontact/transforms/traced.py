@@ -6,7 +6,7 @@ then: multiplication carries the NaN into the derivatives too, where `jnp.where`
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 Tree = TypeVar("Tree")
 
 
-def is_traced(tree: Any) -> bool:
+def is_traced(tree: object) -> bool:
     """Return True if JAX traces a leaf of the pytree."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
