@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, fields
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.transforms.time_loop import Checkpoint
@@ -101,7 +101,8 @@ def estimate_memory(
     is_gradient = gradient or matrix_gradient
     kept = field if is_gradient else 2 * field + vector
     trajectory = (n_records + 1) * (kept + pairs + item)
-    trajectory += steps * (pairs + 2 * n_pairs + 8 + item)
+    n_problems = len(stepper.operators.problems)
+    trajectory += steps * (pairs + 2 * n_problems * (pairs + n_pairs) + 8 + item)
     residuals = cotangents = 0
     if is_gradient:
         per_step = n_pairs + item
@@ -163,14 +164,16 @@ def _device_memory() -> int | None:
     return None
 
 
-def _bytes(tree: Any) -> int:
+def _bytes(tree: object) -> int:
     """Return the bytes of all arrays of a pytree."""
-    return sum(x.size * jnp.dtype(x.dtype).itemsize for x in jax.tree.leaves(tree))
+    return sum(np.size(x) * jnp.result_type(x).itemsize for x in jax.tree.leaves(tree))
 
 
-def _float_bytes(tree: Any) -> int:
+def _float_bytes(tree: object) -> int:
     """Return the bytes of the arrays of a pytree that have a derivative."""
-    return sum(_bytes(x) for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating))
+    return sum(
+        _bytes(x) for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)
+    )
 
 
 def _readable(n_bytes: float) -> str:
