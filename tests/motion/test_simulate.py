@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.bodies import BLOCK, DT, ELASTIC, VISCOUS, block, random_control, random_initial
+from support.bodies import (
+    BLOCK,
+    DT,
+    ELASTIC,
+    VISCOUS,
+    block,
+    block_scene,
+    discretized,
+    random_control,
+    random_initial,
+)
 from support.independent import assemble, kkt_violation
 from support.independent import simulate as simulate_independently
 
@@ -223,14 +233,12 @@ def test_simulate_rotated_scene_moves_as_the_rotated_body():
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     control = random_control(STEPS)
     upright = jc.simulate(block(), control)
-    rotated = jc.simulate(
-        block(
-            mesh=BLOCK.with_points(BLOCK.points @ turn.T),
-            normal=turn @ [0.0, 1.0],
-            force=turn @ [0.0, -10.0],
-        ),
-        control @ turn.T,
+    scene = block_scene(
+        mesh=BLOCK.with_points(BLOCK.points @ turn.T),
+        normal=turn @ [0.0, 1.0],
+        force=turn @ [0.0, -10.0],
     )
+    rotated = jc.simulate(jc.prepare(discretized(scene), DT), control @ turn.T)
     assert np.any(upright.active)
     assert relative_difference(rotated.displacement @ turn, upright.displacement) < AGREEMENT
 

@@ -242,7 +242,7 @@ def hasty():
 
 def test_simulate_raises_solve_error_with_step_time_and_residual(hasty):
     with pytest.raises(
-        jc.SolveError, match=r"step 8 of 30 \(time 0.16 s\).*not converged.*residual \d\.\d+e-"
+        jc.SolveError, match=r"step 8 of 30 \(time 0.16 s\).*not converged.*residual of \d\.\d+e-"
     ) as caught:
         jc.simulate(hasty, steps=30)
     assert isinstance(caught.value, RuntimeError)
