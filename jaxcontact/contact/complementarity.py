@@ -152,20 +152,19 @@ def solve_compliance(compliance: Array, active: Array, softness: Array | None, r
     """
     inside = active[:, None] & active[None, :]
     diagonal = jnp.where(active, 0.0 if softness is None else softness, 1.0)
+    diagonal = diagonal.astype(compliance.dtype)
     # Scaling by the diagonal keeps pairs of very different stiffness apart.
     scale = jax.lax.rsqrt(jnp.where(active, jnp.diagonal(compliance), 0.0) + diagonal)
     matrix = jnp.where(inside, compliance, 0.0) * scale[:, None] * scale[None, :]
-    matrix = matrix + jnp.diag(diagonal.astype(compliance.dtype) * scale**2)
+    matrix = matrix + jnp.diag(diagonal * scale**2)
     shift = rank_shift(compliance)
     factor = jax.scipy.linalg.cho_factor(
         matrix + shift * jnp.eye(scale.size, dtype=scale.dtype), lower=True
     )
-    solution = jnp.zeros_like(rhs)
-    # The last two passes take the shift out again.
-    for _ in range(3):
-        rest = scale * rhs - matrix @ solution
-        solution = solution + jax.scipy.linalg.cho_solve(factor, rest)
-    return scale * solution
+    first = jax.scipy.linalg.cho_solve(factor, scale * rhs)
+    # Once more for the remainder, which takes the shift out again.
+    rest = scale * rhs - matrix @ first
+    return scale * (first + jax.scipy.linalg.cho_solve(factor, rest))
 
 
 def last_of(pairs: Array) -> Array:
