@@ -27,9 +27,10 @@ def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:
         y: displacement at the start of the step, (n,) [m].
         v: velocity at the start of the step, (n,) [m/s]; it bounds the rounding of the free motion.
     """
-    # One reduction over n for both: small kernels are what a step of a small body consists of.
-    largest = jnp.max(jnp.maximum(jnp.abs(y) / dt, jnp.abs(v)), initial=0.0)
-    resolution = _gap_resolution(system, y, dt * largest) / dt
+    # Of the contact nodes only: a reduction over all unknowns costs 5 % of a step.
+    unknowns = system.normals.unknowns
+    largest = jnp.max(jnp.maximum(jnp.abs(y[unknowns]), dt * jnp.abs(v[unknowns])), initial=0.0)
+    resolution = _gap_resolution(system, y, largest) / dt
     return Bound((system.gap - system.normals @ y) / dt, resolution)
 
 
@@ -39,7 +40,7 @@ def gap_resolution(system: System, y: Array) -> Array:
     A smaller gap is closed. The geometry has the error of its positions, and the free motion that
     of A y, whose terms cancel: tau N D^-1 (tau A y) is at most some max |y|, for every tau.
     """
-    return _gap_resolution(system, y, jnp.max(jnp.abs(y), initial=0.0))
+    return _gap_resolution(system, y, jnp.max(jnp.abs(y[system.normals.unknowns]), initial=0.0))
 
 
 def _gap_resolution(system: System, y: Array, largest: Array) -> Array:
