@@ -63,6 +63,7 @@ class Perturbation(NamedTuple):
     """Pairs that are open in the derivative, whatever their state, (C,) bool."""
 
 
+#: The contact problem itself.
 NO_PERTURBATION = Perturbation()
 
 

@@ -62,6 +62,7 @@ class StepPerturbation(NamedTuple):
         return operators.changed(change)
 
 
+#: The motion itself.
 NO_PERTURBATION = StepPerturbation()
 
 
