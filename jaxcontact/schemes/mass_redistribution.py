@@ -24,6 +24,7 @@ from __future__ import annotations
 import itertools
 from types import ModuleType
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -99,7 +100,9 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
     """
     xp = _numpy_of(offsets, normals)
     squares = xp.sum(offsets**2, axis=2)
-    size = xp.max(xp.where(is_donor, squares, 0.0), axis=1)[:, None]
+    # The weights do not depend on it; the derivative of a maximum is NaN where a compiler rounds
+    # its argument in two ways.
+    size = _constant(xp.max(xp.where(is_donor, squares, 0.0), axis=1))[:, None]
     normal_part = xp.sum(offsets * normals[:, None, :], axis=2)
     tangential = offsets - normal_part[:, :, None] * normals[:, None, :]
     tangential = xp.where(is_donor[:, :, None], tangential, 0.0)
@@ -174,7 +177,7 @@ def _rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
     xp = _numpy_of(points)
     n, d = points.shape
     x = points - points.mean(axis=0)[None, :]
-    x = x / abs(x).max()
+    x = x / _constant(abs(x).max())  # C does not depend on the length of the fields
     fields = [xp.broadcast_to(xp.asarray(axis)[None, :], (n, d)) for axis in np.eye(d)]
     for i, j in itertools.combinations(range(d), 2):
         turn = np.zeros((d, d))
@@ -207,6 +210,11 @@ def _donors(system: System) -> tuple[np.ndarray, np.ndarray, int]:
         pairs.append(np.full(inside.size, pair))
         donors.append(inside)
     return np.concatenate(pairs), np.concatenate(donors), max(map(len, donors))
+
+
+def _constant(x: Array | np.ndarray) -> Array | np.ndarray:
+    """Return a value that counts as constant in derivatives."""
+    return jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
 
 
 def _numpy_of(*values: Array | np.ndarray) -> ModuleType:
