@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.scene.obstacle import Obstacle, gap_and_normals
+from jaxcontact.scene.obstacle import Obstacle, gap_and_normals, position_sizes
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.transforms.traced import is_traced
@@ -53,7 +53,7 @@ def contact_pairs(scene: Scene, points: Array) -> ContactPairs:
     for obstacle, facets in sets:
         nodes = np.unique(facets).astype(np.int32)
         gap, normals = gap_and_normals(obstacle, points[nodes])
-        places = jnp.sum(jnp.abs(normals * points[nodes]), axis=1)
+        places = jnp.abs(normals) @ position_sizes(obstacle, points[nodes])
         rounding = jnp.finfo(points.dtype).eps * places
         parts.append(
             ContactPairs(nodes, gap, normals, nodal_areas(points, facets)[nodes], rounding)
