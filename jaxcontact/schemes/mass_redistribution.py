@@ -117,7 +117,7 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
 
 def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     """Return C, which gives every body of the mesh its own moments back."""
-    body = _bodies(system)[np.asarray(system.free_nodes)]
+    body = connected_bodies(system)[np.asarray(system.free_nodes)]
     is_inside = ~np.isin(np.asarray(system.free_nodes), np.asarray(system.contact_nodes))
     lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
     corrections = [
@@ -129,7 +129,7 @@ def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     return BlockMatrix(nodes, nodes, blocks)
 
 
-def _bodies(system: System) -> np.ndarray:
+def connected_bodies(system: System) -> np.ndarray:
     """Return the number of the connected part of the mesh to which each node belongs, (N,)."""
     columns = np.asarray(system.nodal_mass.columns)
     rows = np.broadcast_to(np.arange(system.n_nodes), columns.shape)
@@ -153,7 +153,7 @@ def _body_correction(
     """
     free, nodes = np.asarray(system.free_nodes), np.flatnonzero(is_body)
     position = np.cumsum(is_body) - 1
-    fields = _rigid_fields(on_host(system.points)[free[nodes]])  # (n, i, k)
+    fields = rigid_fields(on_host(system.points)[free[nodes]])  # (n, i, k)
     entries = np.flatnonzero(is_body[lost.rows])
     left = fields[position[lost.rows[entries]]].swapaxes(1, 2)
     right = fields[position[lost.columns[entries]]]
@@ -172,8 +172,8 @@ def _body_correction(
     return BlockMatrix(inside, inside, blocks)
 
 
-def _rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
-    """Return translations and rotations (1D: translation and stretch) at the points, (n, d, k)."""
+def rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
+    """Return translations and rotations at the points, then the stretch in 1D, (n, d, k)."""
     xp = _numpy_of(points)
     n, d = points.shape
     x = points - points.mean(axis=0)[None, :]
