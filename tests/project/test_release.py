@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tarfile
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -31,6 +32,42 @@ bar = jc.Scene(
 motion = jc.simulate(jc.prepare(jc.discretize(bar), 0.1), steps=20)
 assert motion.active.any()
 print(jc.__file__)
+"""
+
+#: One use of everything that older versions of JAX break.
+DERIVATIVES = """
+import jax
+import jax.numpy as jnp
+import numpy as np
+import jaxcontact as jc
+
+jax.config.update("jax_enable_x64", True)
+mesh = jc.meshes.interval(1.0, h=0.25)
+wall = jc.HalfSpace(np.array([-0.02]), np.array([1.0]))
+start = jc.State(jnp.zeros((5, 1)), jnp.full((5, 1), -1.0))
+
+def prepare(x):
+    material = jc.KelvinVoigt(young=x[0], poisson=0.0, density=x[1])
+    return jc.prepare(jc.discretize(jc.Scene(mesh, material, contact={"left": wall})), 0.02)
+
+def end(stepper):
+    return jnp.sum(jc.simulate(stepper, steps=8, initial=start).final.displacement ** 2)
+
+def of(x):
+    return end(prepare(x))
+
+at, step = jnp.array([10.0, 1.2]), 1e-4
+assert jnp.allclose(jax.jit(of)(at), of(at), rtol=1e-12)
+batch = jax.vmap(of)(jnp.stack([at, 2.0 * at]))
+assert jnp.allclose(batch[0], of(at), rtol=1e-12)
+slope = jax.grad(of)
+hessian = jax.jit(jax.jacfwd(slope))(at)
+for f, derivative in ((of, slope(at)), (slope, hessian)):
+    steps = step * jnp.eye(2)
+    differences = jnp.stack([(f(at + e) - f(at - e)) / (2.0 * step) for e in steps])
+    assert jnp.allclose(differences, derivative, rtol=1e-5, atol=1e-9)
+assert "scan" in str(jax.make_jaxpr(jax.grad(end, allow_int=True))(prepare(at)))
+print(jax.__version__)
 """
 
 
@@ -99,3 +136,18 @@ def test_distribution_installs_and_simulates(distributions, pattern, tmp_path):
         sys.executable, "-c", SIMULATION, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}
     )
     assert Path(printed.strip()).is_relative_to(target)
+
+
+@pytest.mark.slow
+def test_lowest_version_of_jax_differentiates_a_motion(tmp_path):
+    dependencies = dict(line.split(">=") for line in PROJECT["dependencies"])
+    lowest = dependencies["jax"]
+    assert dependencies["jaxlib"] == lowest
+    folder = tmp_path / "lowest"
+    venv.create(folder, with_pip=True)
+    (python,) = (*folder.glob("bin/python"), *folder.glob("Scripts/python.exe"))
+    others = [line for line in PROJECT["dependencies"] if not line.startswith("jax")]
+    pinned = [f"jax=={lowest}", f"jaxlib=={lowest}", *others]
+    run(str(python), "-m", "pip", "install", "--quiet", *pinned)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    assert run(str(python), "-c", DERIVATIVES, env=environment).strip() == lowest
