@@ -60,6 +60,9 @@ def viscous_loss(system: System, dt: Array, increment: Array) -> Array:
 
 
 def impact_loss(system: System, dt: Array, old: StepState, new: StepState) -> Array:
-    """Return lam.(psi - N y)/tau [J]: what an impulse takes that acts at the new gap."""
-    gap = system.gap - system.normals @ old.displacement
-    return jnp.dot(new.impulse, gap) / dt
+    """Return lam.N(y' - y)/tau [J], the work of the impulse against the contact.
+
+    With exact contact the new gap of a pressed pair is zero, so that it is lam.(psi - N y)/tau.
+    """
+    increment = new.displacement - old.displacement
+    return jnp.dot(new.impulse, system.normals @ increment) / dt
