@@ -18,6 +18,7 @@ from jaxcontact.contact import (
     ProjectedGaussSeidel,
     RelaxedContact,
     SemismoothNewton,
+    SmoothedContact,
     Status,
 )
 from jaxcontact.control import scenes
@@ -26,10 +27,12 @@ from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
+    PhaseMean,
     Verdict,
     check_gradient,
     derivative_report,
     directional_derivative,
+    phase_mean,
 )
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.motion.checks import SolveError
@@ -109,6 +112,7 @@ __all__ = [
     "NewtonCG",
     "OpenBranch",
     "Optax",
+    "PhaseMean",
     "ProjectedGaussSeidel",
     "RedistributedMass",
     "RelaxedContact",
@@ -116,6 +120,7 @@ __all__ = [
     "Scene",
     "SemismoothNewton",
     "SignedDistance",
+    "SmoothedContact",
     "SolveError",
     "State",
     "StaticContact",
@@ -149,6 +154,7 @@ __all__ = [
     "load_result",
     "meshes",
     "optimize",
+    "phase_mean",
     "plot",
     "prepare",
     "read_mesh",
