@@ -172,6 +172,7 @@ class ContactNormals:
         """Number of contact pairs, C."""
         return self.unknowns.shape[0]
 
+    @jax.jit
     def __matmul__(self, y: Array) -> Array:
         """Return N y, (C,), for y (n,)."""
         return jnp.sum(self.weights * y[self.unknowns], axis=1)

@@ -132,6 +132,7 @@ class System:
         return _lift(self, x)
 
     @in_full_precision
+    @jax.jit
     def restrict(self, y: Array) -> Array:
         """Return the unknowns (..., n) of a nodal field (..., N, d).
 
@@ -241,6 +242,7 @@ def _free_components(system: System, y: Array) -> Array:
 
 
 @in_full_precision
+@jax.jit
 def _lift(system: System, x: Array) -> Array:
     if system.basis is not None:
         x = x @ system.basis.vectors.T

@@ -336,6 +336,15 @@ def test_simulate_compiles_nothing_for_new_values(caplog):
         assert [r for r in caplog.records if "Compiling" in r.getMessage()]
 
 
+def test_scene_of_a_new_shape_compiles_in_few_programs(caplog):
+    scene = block_scene(mesh=jc.meshes.rectangle((2.5, 1.0), h=0.5))
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        jc.simulate(jc.prepare(jc.discretize(scene), DT), steps=1)
+    programs = [r for r in caplog.records if "Compiling" in r.getMessage()]
+    # One after the other its operations are 160 programs, of which some may be there already.
+    assert 5 < len(programs) < 25
+
+
 def wave_error(dt, time=0.4):
     """Distance of a clamped vibrating bar to its exact semi-discrete motion"""
     mesh = jc.meshes.interval(2.0, h=0.5)
