@@ -24,7 +24,10 @@ hypothesis.settings.load_profile("fixed")
 
 #: A quarter of the time to compile, for slower machine code of the same operations. The longer
 #: pass runs what users run, and so does the fast one with an empty XLA_FLAGS.
-QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_COMPILATION = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
 
 
 def pytest_configure(config):
