@@ -133,7 +133,7 @@ def half_disc_control(
     stepper = prepare(system, dt, **prepare_options)
     # Before the reference takes as much.
     check_run_memory(stepper, steps)
-    down = jnp.zeros(system.dimension, dtype).at[-1].set(-1.0)
+    down = jnp.asarray(-np.eye(system.dimension)[-1], dtype)
     reference = jnp.broadcast_to(down, (steps, system.n_nodes, system.dimension))
     return ControlProblem(
         scene=scene,

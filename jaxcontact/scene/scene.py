@@ -89,9 +89,15 @@ def cellwise_material(scene: Scene) -> KelvinVoigt:
     region_of_cell = np.zeros(scene.mesh.n_cells, np.int32)
     for number, region in enumerate(scene.material):
         region_of_cell[scene.mesh.regions[region]] = number
+    return _spread(tuple(scene.material.values()), region_of_cell)
+
+
+@jax.jit
+def _spread(materials: tuple[KelvinVoigt, ...], region_of_cell: Array) -> KelvinVoigt:
+    """Return the material of every cell, its fields (E,), from those of the regions."""
     return jax.tree.map(
         lambda *values: jnp.stack([jnp.asarray(value, float) for value in values])[region_of_cell],
-        *scene.material.values(),
+        *materials,
     )
 
 

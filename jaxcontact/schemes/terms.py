@@ -8,14 +8,26 @@ from jax import Array
 
 from jaxcontact.contact import Bound
 from jaxcontact.schemes.interface import StepState
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 
 
 def trapezoidal_matrix(system: System, dt: Array) -> SymmetricMatrix:
     """Return D = M + tau/2 B + tau^2/4 A, (n, n)."""
-    matrix = system.mass + 0.25 * dt**2 * system.stiffness
-    return matrix if system.viscosity is None else matrix + 0.5 * dt * system.viscosity
+    values = _trapezoidal_values(system.mass, system.stiffness, system.viscosity, dt)
+    return SymmetricMatrix(values, system.stiffness.columns)
+
+
+# The values alone: the pattern must stay concrete where the caller is under jit.
+@jax.jit
+def _trapezoidal_values(
+    mass: ComponentwiseMatrix | SymmetricMatrix,
+    stiffness: SymmetricMatrix,
+    viscosity: SymmetricMatrix | None,
+    dt: Array,
+) -> Array:
+    matrix = mass + 0.25 * dt**2 * stiffness
+    return (matrix if viscosity is None else matrix + 0.5 * dt * viscosity).values
 
 
 def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:

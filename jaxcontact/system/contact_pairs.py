@@ -8,6 +8,7 @@ are one set, and of pairs at one node with equal normals only the nearest can ev
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from jax import Array
 from jaxcontact.scene.obstacle import Obstacle, gap_and_normals
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import nodal_areas
+from jaxcontact.system.block_matrix import concatenate
 from jaxcontact.transforms.traced import is_traced
 
 #: Normals that differ by no more than this times the unit roundoff are equal.
@@ -30,40 +32,58 @@ class ContactPairs(NamedTuple):
     nodes: np.ndarray
     """Node of each pair, (C,) int32."""
 
-    gap: Array
+    gap: Array | np.ndarray
     """Distance to the obstacle, (C,) [m]."""
 
-    normals: Array
+    normals: Array | np.ndarray
     """Unit normals towards the obstacle, (C, d)."""
 
-    area: Array
+    area: Array | np.ndarray
     """Integral of the hat function of the node over its contact set, (C,) [m^(d-1)]."""
 
-    rounding: Array
-    """Rounding error of the gap that the positions of node and obstacle bring, (C,) [m]."""
+    rounding: Array | np.ndarray
+    """Rounding error of the gap, that of the positions of node and obstacle included, (C,) [m]."""
 
 
-def contact_pairs(scene: Scene, points: Array) -> ContactPairs:
-    """Return the contact pairs of the node positions (N, d)."""
+def contact_pairs(scene: Scene, points: Array | np.ndarray, dtype: np.dtype) -> ContactPairs:
+    """Return the contact pairs, in the digits of the node positions.
+
+    Args:
+        scene: the scene.
+        points: node positions, (N, d) [m].
+        dtype: the type to which the gap will be rounded.
+    """
     sets = _merge_sets(scene)
     if not sets:
-        nothing = jnp.zeros(0, points.dtype)
+        nothing = np.zeros(0)
         return ContactPairs(np.zeros(0, np.int32), nothing, points[:0], nothing, nothing)
     parts = []
     for obstacle, facets in sets:
         nodes = np.unique(facets).astype(np.int32)
-        gap, normals = gap_and_normals(obstacle, points[nodes])
-        places = jnp.sum(jnp.abs(normals * points[nodes]), axis=1)
-        rounding = jnp.finfo(points.dtype).eps * places
-        parts.append(
-            ContactPairs(nodes, gap, normals, nodal_areas(points, facets)[nodes], rounding)
-        )
+        places = jnp.asarray(points[nodes])
+        gap, normals = gap_and_normals(obstacle, places)
+        area = _areas(points, facets, nodes)
+        rounding = _rounding(gap, normals, places, dtype)
+        parts.append(ContactPairs(nodes, gap, normals, area, rounding))
     nodes, *values = zip(*parts, strict=True)
-    pairs = ContactPairs(np.concatenate(nodes), *map(jnp.concatenate, values))
+    pairs = ContactPairs(np.concatenate(nodes), *(concatenate(*value) for value in values))
     if is_traced((pairs.gap, pairs.normals)):
         return pairs
     set_of_pair = np.repeat(np.arange(len(sets)), [len(part.nodes) for part in parts])
     return _drop_twins(pairs, set_of_pair, [facets for _, facets in sets], points)
+
+
+@jax.jit
+def _areas(points: Array, facets: Array, nodes: Array) -> Array:
+    """Return the integral of the hat function of each of the nodes, (C,) [m^(d-1)]."""
+    return nodal_areas(points, facets)[nodes]
+
+
+@partial(jax.jit, static_argnames="dtype")
+def _rounding(gap: Array, normals: Array, places: Array, dtype: np.dtype) -> Array:
+    """Return the rounding error (C,) [m] of gaps that were measured from places (C, d)."""
+    of_places = jnp.finfo(places.dtype).eps * jnp.sum(jnp.abs(normals * places), axis=1)
+    return jax.lax.stop_gradient(of_places + 4.0 * jnp.finfo(dtype).eps * jnp.abs(gap))
 
 
 def _merge_sets(scene: Scene) -> list[tuple[Obstacle, np.ndarray]]:
@@ -91,7 +111,10 @@ def _are_equal(first: Obstacle, second: Obstacle) -> bool:
 
 
 def _drop_twins(
-    pairs: ContactPairs, set_of_pair: np.ndarray, facets: list[np.ndarray], points: Array
+    pairs: ContactPairs,
+    set_of_pair: np.ndarray,
+    facets: list[np.ndarray],
+    points: Array | np.ndarray,
 ) -> ContactPairs:
     """Keep the nearest of the concrete pairs at one node that have one normal.
 
@@ -123,4 +146,4 @@ def _drop_twins(
                     areas[joined] = np.asarray(nodal_areas(points, union))
                 area[kept] = areas[joined][node]
     values = (gap, normals, area, np.asarray(pairs.rounding))
-    return ContactPairs(pairs.nodes[keep], *(jnp.asarray(x[keep]) for x in values))
+    return ContactPairs(pairs.nodes[keep], *(x[keep] for x in values))

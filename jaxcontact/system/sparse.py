@@ -10,6 +10,7 @@ transpose is the same gather.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -131,10 +132,7 @@ class ComponentwiseMatrix:
 
     def expand(self) -> SymmetricMatrix:
         """Return the matrix with all entries of its blocks, those between components zero."""
-        n_nodes, d = self.scalar.size, self.dimension
-        identity = jnp.eye(d, dtype=self.scalar.values.dtype)
-        blocks = self.scalar.values[:, None, :, None] * identity[None, :, None, :]
-        return SymmetricMatrix(blocks.reshape(-1, n_nodes * d), self.scalar.columns)
+        return SymmetricMatrix(_spread(self.scalar.values, self.dimension), self.scalar.columns)
 
     def diagonal(self) -> Array:
         """Return the diagonal, (n,)."""
@@ -143,6 +141,13 @@ class ComponentwiseMatrix:
     def to_scipy(self) -> scipy.sparse.csr_array:
         """Return a SciPy CSR copy (concrete matrices only)."""
         return self.expand().to_scipy()
+
+
+@partial(jax.jit, static_argnums=1)
+def _spread(values: Array, d: int) -> Array:
+    """Return the entries of d components that are not coupled, (width d, N d), of (width, N)."""
+    blocks = values[:, None, :, None] * jnp.eye(d, dtype=values.dtype)[None, :, None, :]
+    return blocks.reshape(-1, values.shape[1] * d)
 
 
 @jax.tree_util.register_dataclass
@@ -167,6 +172,7 @@ class ContactNormals:
         """Number of contact pairs, C."""
         return self.unknowns.shape[0]
 
+    @jax.jit
     def __matmul__(self, y: Array) -> Array:
         """Return N y, (C,), for y (n,)."""
         return jnp.sum(self.weights * y[self.unknowns], axis=1)

@@ -132,6 +132,7 @@ class System:
         return _lift(self, x)
 
     @in_full_precision
+    @jax.jit
     def restrict(self, y: Array) -> Array:
         """Return the unknowns (..., n) of a nodal field (..., N, d).
 
@@ -188,6 +189,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         cellwise_material(scene),
         pattern,
         all_nodes,
+        free_nodes,
         None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
         {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
         is_elastic=is_elastic(scene),
@@ -195,8 +197,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
         # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, jnp.asarray(mesh.points))
-    rounding = pairs.rounding + 4.0 * jnp.finfo(dtype).eps * jnp.abs(pairs.gap)
+        pairs = contact_pairs(scene, as_array(mesh.points), dtype)
     components = np.arange(dimension, dtype=np.int32)
     unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
 
@@ -209,12 +210,14 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(pairs.normals.astype(dtype), unknowns, dimension * free_nodes.size),
-        gap=pairs.gap.astype(dtype),
-        gap_rounding=jax.lax.stop_gradient(rounding).astype(dtype),
-        load=values.load[free_nodes].reshape(-1),
+        normals=ContactNormals(
+            jnp.asarray(pairs.normals, dtype), unknowns, dimension * free_nodes.size
+        ),
+        gap=jnp.asarray(pairs.gap, dtype),
+        gap_rounding=jnp.asarray(pairs.rounding, dtype),
+        load=values.load,
         contact_nodes=pairs.nodes,
-        contact_area=pairs.area.astype(dtype),
+        contact_area=jnp.asarray(pairs.area, dtype),
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
@@ -239,6 +242,7 @@ def _free_components(system: System, y: Array) -> Array:
 
 
 @in_full_precision
+@jax.jit
 def _lift(system: System, x: Array) -> Array:
     if system.basis is not None:
         x = x @ system.basis.vectors.T
