@@ -8,7 +8,7 @@ contact depends on the phase of the touch within its step, and does not converge
 over that phase. One period of it is a change v of x, at which the law lets the share z / sinh z,
 z = 2 pi^2 s / v, of the oscillation through: 0.6 % at s = 0.4 v.
 
-Source: MATH.md 6; Chen, Mangasarian, Comput. Optim. Appl. 5 (1996) 97-138 for the softplus.
+Source: MATH.md 8; Chen, Mangasarian, Comput. Optim. Appl. 5 (1996) 97-138 for the softplus.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The energy that a discrete motion loses at a touch depends on the place of the touch within its
 step with amplitude O(h), and that place on the data with slope O(1/h): the exact derivative of a
 motion through an impact has an error that no refinement removes. A gap that is larger by v dt, v
-the closing speed, moves the touch by one step: one period. Source: MATH.md 6.
+the closing speed, moves the touch by one step: one period. Source: MATH.md 8.
 """
 
 from __future__ import annotations
