@@ -116,8 +116,9 @@ def solve(
 
     def noise(x: Array) -> Array:
         pair = law(x)
-        size = jnp.abs(compliance) @ pair.multiplier + jnp.abs(offset) + pair.separation
-        return jnp.finfo(x.dtype).eps * size
+        # |W_ij| <= sqrt(W_ii W_jj): a bound of the terms of W p without another product.
+        terms = scale * jnp.dot(scale, pair.multiplier)
+        return jnp.finfo(x.dtype).eps * (terms + jnp.abs(offset) + pair.separation)
 
     def merit(x: Array, error: Array) -> Array:
         # Rounding of a pair far from contact must not hide the descent of the others.
@@ -130,8 +131,11 @@ def solve(
     def newton_direction(x: Array, error: Array) -> Array:
         pair = law(x)
         root = jnp.sqrt(pair.closed / diagonal)
-        matrix = root[:, None] * compliance * root[None, :] + jnp.diag(pair.open)
-        scaled = root * solve_unit_diagonal(matrix, -root * error)
+
+        def product(u: Array) -> Array:
+            return root * (compliance @ (root * u)) + pair.open * u
+
+        scaled = root * _conjugate_gradients(product, -root * error)
         return diagonal * scaled - error - compliance @ scaled
 
     def advance(descent: _Descent) -> _Descent:
@@ -167,6 +171,49 @@ def solve(
     goal = 64.0 * goal + complementarity.tolerance(offset, resolution)
     solution = _finish(law(x).multiplier, x, error, goal, steps)
     return solution._replace(workspace=solution.multiplier)
+
+
+class _Krylov(NamedTuple):
+    """The iteration of conjugate gradients."""
+
+    solution: Array
+    """x, (C,)."""
+
+    rest: Array
+    """Its residual r, (C,)."""
+
+    direction: Array
+    """The search direction, (C,)."""
+
+    square: Array
+    """r . r, scalar."""
+
+    steps: Array
+    """Products so far, int32."""
+
+
+def _conjugate_gradients(product: Callable[[Array], Array], rhs: Array) -> Array:
+    """Return x, (C,), with an SPD product x = rhs.
+
+    Rows of open pairs are those of the identity, so that there are about as many steps as closed
+    pairs; a Cholesky factor of all pairs costs more from about 30 on.
+    """
+    least = jnp.finfo(rhs.dtype).eps ** 2 * jnp.vdot(rhs, rhs)
+
+    def is_unfinished(state: _Krylov) -> Array:
+        return (state.square > least) & (state.steps < 2 * rhs.size + 8)
+
+    def advance(state: _Krylov) -> _Krylov:
+        image = product(state.direction)
+        length = state.square / jnp.vdot(state.direction, image)
+        rest = state.rest - length * image
+        square = jnp.vdot(rest, rest)
+        direction = rest + square / state.square * state.direction
+        solution = state.solution + length * state.direction
+        return _Krylov(solution, rest, direction, square, state.steps + 1)
+
+    start = _Krylov(jnp.zeros_like(rhs), rhs, rhs, jnp.vdot(rhs, rhs), jnp.int32(0))
+    return jax.lax.while_loop(is_unfinished, advance, start).solution
 
 
 def _finish(multiplier: Array, x: Array, error: Array, goal: Array, steps: Array) -> Solution:

@@ -170,7 +170,7 @@ def test_smoothed_motion_has_forces_that_decay_with_the_gap():
     problem = grazing(contact_solver=jc.SmoothedContact(speed))
     trajectory = problem.simulate(jnp.full((20, 2, 1), 10.0))
     s, compliance = 0.4 * speed, np.asarray(problem.stepper.contact_problem.compliance)
-    force = np.exp(-compliance * trajectory.contact_impulse / 2.0 / s)
+    force = np.exp(-compliance * np.asarray(trajectory.contact_impulse) / 2.0 / s)
     gap = np.exp(-trajectory.gap[1:] / (s * DT))
     assert np.min(force) < 0.1  # it touches
     assert np.min(gap) < 0.1  # it is open

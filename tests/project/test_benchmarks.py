@@ -19,7 +19,7 @@ RESULTS = {
     "compile_time": ["forward_s", "gradient_s"],
     "contact_solvers": ["newton_cold_us", "newton_warm_us", "gauss_seidel_us"],
     "gradient_convergence": ["gradient", "value"],
-    "identification": ["median_miss", "median_misfit"],
+    "identification": ["median_miss", "median_gradients"],
 }
 
 
