@@ -128,7 +128,8 @@ class IterativeFactor:
                 lambda change: self._wanted_residual(terms, size + change),
                 self.max_iterations,
             )
-            return w + z, is_small
+            # Many iterations gather rounding errors in the directions that are projected out.
+            return lifted + restrict(w + z), is_small
 
         # Twice: the residual of the recurrence misses its own rounding errors, which the second
         # run removes where they matter; where not it takes no iteration.

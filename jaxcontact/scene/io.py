@@ -6,7 +6,7 @@ import contextlib
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,49 @@ _ADVICE = {
         "only (Gmsh: Mesh.SaveAll=0) or in the older format (gmsh -format msh22)"
     ),
 }
+
+#: Formats whose readers in meshio ask for ever for the next line of a file that is cut off, and
+#: whether they read text.
+_ENDLESS = {
+    ".nas": ("nastran", True),
+    ".bdf": ("nastran", True),
+    ".fem": ("nastran", True),
+    ".dat": ("tecplot", True),
+    ".tec": ("tecplot", True),
+    ".off": ("off", True),
+    ".mdpa": ("mdpa", False),
+    ".ply": ("ply", False),
+}
+
+
+class _EndingText(io.TextIOWrapper):
+    """A text file that does not end in silence."""
+
+    n_empty = 0
+
+    def readline(self, size: int = -1, /) -> str:
+        """Return the next line; an EOFError if there has been none for a hundred times."""
+        return _count_empty(self, super().readline(size))
+
+
+class _EndingBytes(io.BufferedReader):
+    """A binary file that does not end in silence."""
+
+    n_empty = 0
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        """Return the next line; an EOFError if there has been none for a hundred times."""
+        return _count_empty(self, super().readline(size))
+
+
+Line = TypeVar("Line", str, bytes)
+
+
+def _count_empty(file: _EndingText | _EndingBytes, line: Line) -> Line:
+    file.n_empty = 0 if line else file.n_empty + 1
+    if file.n_empty > 100:
+        raise EOFError("the file is cut off")
+    return line
 
 
 def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> Mesh:
@@ -119,7 +162,12 @@ def _read(path: Path) -> meshio.Mesh:
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path)
+            if path.suffix.lower() not in _ENDLESS:
+                return meshio.read(path)
+            file_format, is_text = _ENDLESS[path.suffix.lower()]
+            file = _EndingBytes(path.open("rb", buffering=0))
+            with _EndingText(file) if is_text else file as lines:
+                return meshio.read(lines, file_format)
     except (OSError, ImportError):
         raise
     except (Exception, SystemExit) as error:

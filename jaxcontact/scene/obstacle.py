@@ -124,6 +124,21 @@ def _normals(gradient: Array, radius: Array) -> tuple[Array, Array]:
     return poison_unless(is_distance & (radius > 0.0), values)
 
 
+def position_sizes(obstacle: Obstacle, points: Array) -> Array:
+    """Return the size of the positions that a signed distance is made of, (d,) [m].
+
+    Its rounding error is relative to them, also at a node whose own position is zero.
+
+    Args:
+        obstacle: the rigid obstacle; of a user's own one, only the points are known.
+        points: contact nodes, (C, d) [m].
+    """
+    sizes = jnp.max(jnp.abs(points), axis=0)
+    for name in ("point", "center", "radius"):
+        sizes = jnp.maximum(sizes, jnp.abs(as_array(getattr(obstacle, name, 0.0))))
+    return sizes
+
+
 def _check_slope(obstacle: Obstacle, slope: np.ndarray) -> None:
     what = f"the signed distance of {type(obstacle).__name__}"
     if not np.all(slope > 0.0):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -59,7 +60,11 @@ class ContactStabilized:
         u, predicted = predictor.solve(operators.mass @ v, bound, first_guess)
         rhs = operators.mass @ u - 0.5 * dt * (system.stiffness @ y - load)
         w, solution = problem.solve(rhs, bound, guess)
-        velocity, impulse = v + 2.0 * (w - u), 2.0 * solution.multiplier
+        change = w - u
+        if problem.contact_solver.is_exact:
+            held = (solution.multiplier > 0.0) & (predicted.multiplier > 0.0)
+            change = change - _rounding(system, change, held)
+        velocity, impulse = v + 2.0 * change, 2.0 * solution.multiplier
         return StepResult(y + dt * w, velocity, impulse, (solution, predicted))
 
     def losses(
@@ -71,3 +76,16 @@ class ContactStabilized:
         taken = 0.5 * (old.velocity + new.velocity) - increment / dt
         predictor_loss = -jnp.dot(taken, operators.mass @ (new.velocity - old.velocity))
         return Losses(impact_loss(system, dt, old, new) + predictor_loss)
+
+
+def _rounding(system: System, change: Array, held: Array) -> Array:
+    """Return the part (n,) of w - u that moves a held pair along its normal: u and w are on psi.
+
+    At rest it is the same rounding error in every step, which no later one takes out of the stale
+    velocity of a pinned node: the kinetic energy would grow with the square of the time, in float32
+    to 1e-6 of the potential energy of a block in 200 000 steps. Taken out one pair after the other:
+    of pairs at one node with oblique normals, a part as large as their cosine stays.
+    """
+    along = jnp.where(held, system.normals @ change, 0.0)
+    part = system.normals.transposed_product(along, system.size)
+    return jax.lax.stop_gradient(part)

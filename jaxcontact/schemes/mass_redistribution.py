@@ -24,6 +24,7 @@ from __future__ import annotations
 import itertools
 from types import ModuleType
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -98,7 +99,9 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
     """
     xp = _numpy_of(offsets, normals)
     squares = xp.sum(offsets**2, axis=2)
-    size = xp.max(xp.where(is_donor, squares, 0.0), axis=1)[:, None]
+    # The weights do not depend on it; the derivative of a maximum is NaN where a compiler rounds
+    # its argument in two ways.
+    size = _constant(xp.max(xp.where(is_donor, squares, 0.0), axis=1))[:, None]
     normal_part = xp.sum(offsets * normals[:, None, :], axis=2)
     tangential = offsets - normal_part[:, :, None] * normals[:, None, :]
     tangential = xp.where(is_donor[:, :, None], tangential, 0.0)
@@ -140,7 +143,7 @@ def _body_correction(
     """
     free, nodes = np.asarray(system.free_nodes), np.flatnonzero(is_body)
     position = np.cumsum(is_body) - 1
-    fields = _rigid_fields(on_host(system.points)[free[nodes]])  # (n, i, k)
+    fields = rigid_fields(on_host(system.points)[free[nodes]])  # (n, i, k)
     entries = np.flatnonzero(is_body[lost.rows])
     left = fields[position[lost.rows[entries]]].swapaxes(1, 2)
     right = fields[position[lost.columns[entries]]]
@@ -159,12 +162,12 @@ def _body_correction(
     return BlockMatrix(inside, inside, blocks)
 
 
-def _rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
-    """Return translations and rotations (1D: translation and stretch) at the points, (n, d, k)."""
+def rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
+    """Return translations and rotations at the points, then the stretch in 1D, (n, d, k)."""
     xp = _numpy_of(points)
     n, d = points.shape
     x = points - points.mean(axis=0)[None, :]
-    x = x / abs(x).max()
+    x = x / _constant(abs(x).max())  # C does not depend on the length of the fields
     fields = [xp.broadcast_to(xp.asarray(axis)[None, :], (n, d)) for axis in np.eye(d)]
     for i, j in itertools.combinations(range(d), 2):
         turn = np.zeros((d, d))
@@ -197,6 +200,11 @@ def _donors(system: System) -> tuple[np.ndarray, np.ndarray, int]:
         pairs.append(np.full(inside.size, pair))
         donors.append(inside)
     return np.concatenate(pairs), np.concatenate(donors), max(map(len, donors))
+
+
+def _constant(x: Array | np.ndarray) -> Array | np.ndarray:
+    """Return a value that counts as constant in derivatives."""
+    return jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
 
 
 def _numpy_of(*values: Array | np.ndarray) -> ModuleType:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.scene.obstacle import Obstacle, gap_and_normals
+from jaxcontact.scene.obstacle import Obstacle, gap_and_normals, position_sizes
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.block_matrix import concatenate
@@ -63,7 +63,8 @@ def contact_pairs(scene: Scene, points: Array | np.ndarray, dtype: np.dtype) -> 
         places = jnp.asarray(points[nodes])
         gap, normals = gap_and_normals(obstacle, places)
         area = _areas(points, facets, nodes)
-        rounding = _rounding(gap, normals, places, dtype)
+        sizes = position_sizes(obstacle, places)
+        rounding = _rounding(gap, normals, sizes, dtype)
         parts.append(ContactPairs(nodes, gap, normals, area, rounding))
     nodes, *values = zip(*parts, strict=True)
     pairs = ContactPairs(np.concatenate(nodes), *(concatenate(*value) for value in values))
@@ -80,9 +81,9 @@ def _areas(points: Array, facets: Array, nodes: Array) -> Array:
 
 
 @partial(jax.jit, static_argnames="dtype")
-def _rounding(gap: Array, normals: Array, places: Array, dtype: np.dtype) -> Array:
-    """Return the rounding error (C,) [m] of gaps that were measured from places (C, d)."""
-    of_places = jnp.finfo(places.dtype).eps * jnp.sum(jnp.abs(normals * places), axis=1)
+def _rounding(gap: Array, normals: Array, sizes: Array, dtype: np.dtype) -> Array:
+    """Return the rounding error (C,) [m] of gaps between positions of the sizes (d,)."""
+    of_places = jnp.finfo(sizes.dtype).eps * (jnp.abs(normals) @ sizes)
     return jax.lax.stop_gradient(of_places + 4.0 * jnp.finfo(dtype).eps * jnp.abs(gap))
 
 

@@ -335,3 +335,20 @@ def test_conjugate_gradient_refuses_options_that_cannot_work(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"{name} must be"):
         jc.ConjugateGradient(**options)
+
+
+def test_constraint_holds_to_rounding_after_many_iterations():
+    # Cells of 1 to 30: some hundred iterations, in which the projected directions drift.
+    mesh = jc.meshes.rectangle((1.0, 1.0), h=1 / 5)
+    flat = mesh.with_points(mesh.points * np.array([1.0, 0.03]))
+    plane = jc.HalfSpace(np.array([0.0, -0.01]), np.array([0.6, 0.8]))
+    scene = jc.Scene(flat, jc.KelvinVoigt(young=1.0, poisson=0.3), contact={"bottom": plane})
+    factor = jc.prepare(
+        jc.discretize(scene), 3.0, linear_solver=jc.ConjugateGradient()
+    ).operators.problem.form.factor
+    pairs = factor.normals.count
+    bound, rhs = jnp.linspace(0.0, 1.0, pairs), jnp.sin(jnp.arange(factor.matrix.size, dtype=float))
+    active = jnp.arange(pairs) % 2 == 0
+    w, _ = factor.solve_constrained(active, rhs, bound)
+    missed = jnp.where(active, factor.normals @ w - bound, 0.0)
+    assert jnp.max(jnp.abs(missed)) < 1e-14
