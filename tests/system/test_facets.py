@@ -181,6 +181,22 @@ def test_facets_are_differentiable_where_meshes_match():
     np.testing.assert_allclose(by_points, (ahead - behind) / (2.0 * step), rtol=1e-5)
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_facets_of_traced_nodes_stay_right_for_small_motions(d):
+    mesh = stacked(1 / 3, 1 / 3, d, gap=0.1)
+    moves = 0.01 * np.random.default_rng(5).uniform(-1.0, 1.0, size=mesh.points.shape)
+    is_on_face = (mesh.points < 1e-9) | (mesh.points > 1.0 - 1e-9)
+    points = mesh.points + np.where(is_on_face, 0.0, moves)
+    field = jnp.asarray(np.random.default_rng(6).normal(size=points.shape))
+
+    def rows(points):
+        system = jc.discretize(touching(mesh.with_points(points)))
+        return system.normals @ system.restrict(field), system.gap, system.contact_area
+
+    for traced, concrete in zip(jax.jit(rows)(jnp.asarray(points)), rows(points), strict=True):
+        np.testing.assert_allclose(traced, concrete, rtol=1e-12, atol=1e-13)
+
+
 ONCE = r"'lower/top' -> 'upper/bottom' and 'upper/bottom' -> 'lower/top' constrain the same gap"
 TWO_SIDED = {"upper/bottom": jc.Facets("lower/top"), "lower/top": jc.Facets("upper/bottom")}
 
