@@ -16,9 +16,9 @@ parallel to nu_i: contact forces balance in force and torque. A uniform pressure
 surfaces is met exactly on any two meshes (patch test). Everything is of NumPy or JAX, as the node
 positions are; d corners of a facet in d dimensions.
 
-Source: Wohlmuth, SIAM J. Numer. Anal. 38 (2000) 989-1012; Popp, Gitterle, Gee, Wall, Int. J.
-Numer. Meth. Engng 83 (2010) 1428-1465. Here each row is divided by D_i, and the gap is that of the
-node: an averaged one sees penetration in a curved gap that is closed at the nodes.
+Source: Wohlmuth, SIAM J. Numer. Anal. 38 (2000) 989-1012; Popp, Gitterle, Gee, Wall, Int. J. Numer.
+Meth. Engng 83 (2010) 1428-1465; MATH.md 9. Here each row is divided by D_i, and the gap is that of
+the node: an averaged one sees penetration in a curved gap that is closed at the nodes.
 """
 
 from __future__ import annotations

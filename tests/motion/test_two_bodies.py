@@ -250,6 +250,37 @@ def test_static_bodies_share_a_uniform_pressure():
     )
 
 
+def test_static_round_bodies_meet_as_hertz_says_on_other_meshes():
+    # Two half discs of one radius against each other are one against the plane between them.
+    radius, depth, n = 15.0, 0.3, 24
+    upper = jc.meshes.half_disc(radius, h=radius / n)
+    lower = jc.meshes.half_disc(radius, h=1.5 * radius / n)
+    lower = lower.moved(np.diag([-1.0, -1.0]), [0.0, -2.0 * radius])
+    down, plane = np.array([0.0, -1.0]), jc.HalfSpace([0.0, -radius], [0.0, 1.0])
+    two = jc.Scene(
+        jc.join({"upper": upper, "lower": lower}),
+        RUBBER,
+        clamped=("upper/clamped", "lower/clamped"),
+        contact={"upper/contact": jc.Facets("lower/contact", along=down)},
+    )
+    one = jc.Scene(upper, RUBBER, clamped=("clamped",), contact={"contact": plane})
+
+    def pressed(scene, depth):
+        system = jc.discretize(scene)
+        return jc.solve_static(system.with_gap(system.gap - depth))
+
+    alone, both = pressed(one, depth), pressed(two, 2.0 * depth)
+    load = np.sum(both.contact_force)
+    np.testing.assert_allclose(load, np.sum(alone.contact_force), rtol=5e-3)
+    # Hertz: half-width a^2 = 4 P R / (pi E), with R and E of both bodies together.
+    modulus = RUBBER.young / (1.0 - RUBBER.poisson**2) / 2.0
+    width = np.sqrt(4.0 * load * 0.5 * radius / (np.pi * modulus))
+    x = two.mesh.points[jc.discretize(two).contact_nodes, 0]
+    expected = 2.0 * load / (np.pi * width) * np.sqrt(np.maximum(1.0 - (x / width) ** 2, 0.0))
+    error = np.linalg.norm(both.contact_pressure - expected) / np.linalg.norm(expected)
+    assert error < 0.05
+
+
 def test_outputs_take_two_bodies(fall, tmp_path):
     stepper, motion = fall
     force = np.asarray(jc.contact_force(motion))
