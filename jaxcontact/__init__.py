@@ -64,7 +64,9 @@ from jaxcontact.optimize import (
     stationarity,
 )
 from jaxcontact.scene import meshes
+from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.io import read_mesh
+from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
@@ -100,6 +102,7 @@ __all__ = [
     "Descent",
     "Ending",
     "Energy",
+    "Facets",
     "GradientCheck",
     "HalfSpace",
     "History",
@@ -150,6 +153,7 @@ __all__ = [
     "energy",
     "estimate_memory",
     "export",
+    "join",
     "l2_value_and_grad",
     "load_result",
     "meshes",

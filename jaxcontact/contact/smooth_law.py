@@ -22,13 +22,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.contact import complementarity
-from jaxcontact.contact.complementarity import (
-    Guess,
-    Solution,
-    Status,
-    separation,
-    solve_unit_diagonal,
-)
+from jaxcontact.contact.complementarity import Guess, Solution, Status, separation
 from jaxcontact.transforms.traced import is_traced
 
 #: Halvings of a Newton step before it is taken anyway.

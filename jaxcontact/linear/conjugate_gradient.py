@@ -189,7 +189,7 @@ def _find_smallest_eigenvalue(factor: IterativeFactor) -> Array:
 class ConjugateGradient:
     """Solve every step by preconditioned conjugate gradients; no factor is stored.
 
-    Works with `SemismoothNewton` and with contact sets in which no node occurs twice.
+    Works with `SemismoothNewton`, rigid obstacles, and contact sets in which no node occurs twice.
     """
 
     tolerance: float = 1e-12
@@ -231,14 +231,14 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if a node belongs to two contact pairs, or if the values are concrete and
-                so ill-conditioned that no solve could succeed.
+            ValueError: if an unknown belongs to two contact pairs, as with two bodies, or if the
+                values are concrete and so ill-conditioned that no solve could succeed.
         """
         unknowns = np.asarray(normals.unknowns)
         if np.unique(unknowns).size != unknowns.size:
             raise ValueError(
-                "ConjugateGradient needs contact sets without common nodes; use "
-                "linear_solver=jc.NestedDissection()"
+                "ConjugateGradient needs contact sets without common nodes, against rigid "
+                "obstacles and not other bodies; use linear_solver=jc.NestedDissection()"
             )
         floor = 8.0 * float(jnp.finfo(matrix.values.dtype).eps)
         preconditioner = _precondition(matrix, normals)

@@ -231,7 +231,7 @@ def _check_pairs(system: System) -> None:
     if system.size != d * len(system.free_nodes) or system.normals.unknowns.shape[1] != d:
         raise ValueError(
             "RedistributedMass needs the nodes of a mesh against rigid obstacles, not a reduced "
-            "model or two bodies; use jc.ContactStabilized()"
+            "model or contact between two bodies; use jc.ContactStabilized()"
         )
     shared = nodes.size - np.unique(nodes).size
     if shared:

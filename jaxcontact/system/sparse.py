@@ -155,14 +155,16 @@ def _spread(values: Array, d: int) -> Array:
 class ContactNormals:
     """The contact operator N of shape (C, n): row i maps y to the normal displacement of pair i.
 
-    Each row touches k unknowns (the d components of one contact node, k = d).
+    Each row touches k unknowns: the d components of one contact node, and of the nodes of another
+    body that it may meet.
     """
 
     weights: Array
-    """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i."""
+    """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i, for another
+    body followed by -m_ij nu_i (see `mortar.py`)."""
 
     unknowns: Array | np.ndarray
-    """Unknown of each entry, (C, k) int32."""
+    """Unknown of each entry, (C, k) int32; entries that are padded name their own with weight 0."""
 
     size: int | None = field(default=None, metadata={"static": True})
     """Number of all unknowns, n; None where it does not matter."""

@@ -56,7 +56,8 @@ class System:
     """Scalar L on all nodes, (N, N) [m^d]; the inner product of controls (N, d), clamped too."""
 
     normals: ContactNormals
-    """N, contact operator, (C, n); rows point from the body to the obstacle."""
+    """N, contact operator, (C, n); rows point from the body to the obstacle, or to the other body,
+    whose displacement they subtract."""
 
     gap: Array
     """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
@@ -71,8 +72,8 @@ class System:
     """Node of each contact pair, (C,) int32."""
 
     contact_area: Array
-    """Integral of the hat function over the contact set, (C,) [m^(d-1)]; impulse / (dt area)
-    is the contact pressure."""
+    """Integral of the hat function over the contact set, (C,) [m^(d-1)], between bodies over what
+    lies before the other one; impulse / (dt area) is the contact pressure."""
 
     points: Array
     """Node positions in the reference configuration, (N, d) [m]."""
@@ -197,9 +198,11 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
         # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, as_array(mesh.points), dtype)
+        pairs = contact_pairs(scene, as_array(mesh.points), is_free, dtype)
+        weights = jnp.asarray(pairs.row_weights(), dtype)
     components = np.arange(dimension, dtype=np.int32)
-    unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
+    rows = numbers[pairs.row_nodes].astype(np.int32)[:, :, None]
+    unknowns = (rows * dimension + components[None, None, :]).reshape(weights.shape)
 
     def on_free(values: Array) -> SymmetricMatrix:
         return SymmetricMatrix(values, pattern.columns)
@@ -210,9 +213,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(
-            jnp.asarray(pairs.normals, dtype), unknowns, dimension * free_nodes.size
-        ),
+        normals=ContactNormals(weights, unknowns, dimension * free_nodes.size),
         gap=jnp.asarray(pairs.gap, dtype),
         gap_rounding=jnp.asarray(pairs.rounding, dtype),
         load=values.load,
