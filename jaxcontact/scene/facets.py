@@ -28,8 +28,8 @@ class Facets:
     """Name of a facet set of the mesh that shares no node with the contact set."""
 
     along: Array | np.ndarray | None = None
-    """Contact direction from the contact set to these facets, (d,), of any positive length; None is
-    the outward normal of the contact set at each node."""
+    """Contact direction from the contact set to these facets, (d,), of any positive length and
+    concrete; None is the outward normal of the contact set at each node."""
 
 
 def check_facets(name: str, facets: Facets, mesh: Mesh) -> None:
@@ -42,7 +42,7 @@ def check_facets(name: str, facets: Facets, mesh: Mesh) -> None:
 
     Raises:
         ValueError: if the facets are not in the mesh or share nodes with the contact set, or the
-            direction is no vector of the dimension, not finite or zero.
+            direction is no vector of the dimension, traced, not finite or zero.
     """
     if facets.name not in mesh.facets:
         raise ValueError(
@@ -62,7 +62,10 @@ def check_facets(name: str, facets: Facets, mesh: Mesh) -> None:
     if along.shape != (mesh.dimension,):
         raise ValueError(f"{where} must have shape ({mesh.dimension},), got {along.shape}")
     if is_traced(along):
-        return
+        raise ValueError(
+            f"{where} must be concrete, since the facets that meet are searched along it; give it "
+            "as a NumPy array from outside of jit, grad and vmap"
+        )
     if not np.all(np.isfinite(along)) or not np.any(along):
         raise ValueError(f"{where} must be finite and not zero, got {along}")
 

@@ -86,10 +86,10 @@ def mortar_rows(
     points: Values,
     slave: np.ndarray,
     ends: np.ndarray,
-    along: Values | None,
+    along: np.ndarray | None,
     meeting: Meeting,
 ) -> MortarRows:
-    """Return the rows of facets that meet, on the host if everything is concrete.
+    """Return the rows of facets that meet, on the host if the positions are concrete.
 
     Args:
         points: node positions, (N, d) [m].
@@ -98,12 +98,11 @@ def mortar_rows(
         along: direction of all rows, (d,), or None for the normals of the contact set.
         meeting: which facets meet.
 
-    Derivative: by the positions and the direction, with the meeting facets fixed; one-sided where
-    the end of one contact set lies exactly on a node or edge of the other.
+    Derivative: by the positions, with the meeting facets fixed; one-sided where the end of one
+    contact set lies exactly on a node or edge of the other.
     """
-    if is_traced((points, along)):
+    if is_traced(points):
         return _traced_rows(points, slave, ends, along, meeting)
-    along = None if along is None else np.asarray(along)
     return _rows(np.asarray(points), slave, ends, along, meeting)
 
 

@@ -45,10 +45,9 @@ def find_meeting(
     Raises:
         ValueError: if no concrete positions are known or no node sees the other body.
     """
-    x, ends, along = _positions(mesh), end_signs(mesh), facets.along
-    along = None if along is None else np.asarray(along, float)
+    x, ends = _positions(mesh), end_signs(mesh)
     nodes, place = np.unique(slave, return_inverse=True)
-    nu = directions(x, slave, ends, along, nodes)
+    nu = directions(x, slave, ends, direction_of(facets), nodes)
 
     # Every node with its own facets, it first, as far as they look along its direction.
     d = slave.shape[1]
@@ -96,6 +95,11 @@ def find_meeting(
     masters, slots = _tables(nodes[rows], row[group], master[other], is_free)
     indices = (nodes[rows], master[hit[rows]], own, row, master[other], group, masters, slots)
     return Meeting(*(np.asarray(index, np.int32) for index in indices))
+
+
+def direction_of(facets: Facets) -> np.ndarray | None:
+    """Return the contact direction, (d,), or None for the normals of the contact set."""
+    return None if facets.along is None else np.asarray(facets.along, float)
 
 
 def end_signs(mesh: Mesh) -> np.ndarray:

@@ -248,3 +248,11 @@ def test_facets_need_concrete_positions_to_be_searched():
 
     with pytest.raises(ValueError, match=r"JAX traces them; .*mesh.with_points"):
         gap(jnp.asarray(mesh.points))
+
+
+def test_facets_need_a_concrete_direction():
+    def gap(along):
+        return jnp.sum(jc.discretize(touching(stacked(1 / 4, 1 / 3), along=along)).gap)
+
+    with pytest.raises(ValueError, match=r"Facets\('lower/top'\).along must be concrete"):
+        jax.grad(gap)(jnp.array([0.0, -1.0]))
