@@ -326,7 +326,7 @@ def chart(rows: list[dict], lines: dict[str, Any]):
         xlabel="place of the touch within its time step",
         ylabel="d(height after the bounce) / d(drop height)",
         title=f"a falling bar, {lines['cells']} cells",
-        ylim=(-4.0, 5.0),
+        ylim=(-1.6, 2.6),
     )
     left.legend()
     styles = {
@@ -357,9 +357,9 @@ def chart(rows: list[dict], lines: dict[str, Any]):
             color=("C3", "C2", "C0")[k],
             label="exact contact" if law == "exact" else law,
         )
-    right.set(yscale="log", title="spread of d(height)/d(gap) over the phase")
+    right.set(yscale="log", title="spread of d(height)/d(gap) over the phase", ylim=(None, 60.0))
     right.set_xticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
-    right.legend()
+    right.legend(loc="upper right", ncols=3, fontsize=7)
     for axis in (left, middle, right):
         axis.grid(alpha=0.3)
     return figure
