@@ -2,7 +2,8 @@
 
 The same iteration as `SemismoothNewton`, A <- {i: p_i / d_i - g_i > 0} with g = b - N w, but each
 active set costs one iterative solve with the whole matrix, and d_i = (N D N^T)_ii stands for the
-inverse of the compliance. For systems too large to factorise.
+inverse of the compliance. For systems too large to factorise. Where the sets cycle, Murty's rule
+goes on from the last one, as in `newton.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from jaxcontact.contact.complementarity import (
     Guess,
     Solution,
     Status,
+    last_of,
 )
+from jaxcontact.contact.newton import SETS_OF_SAFEGUARD
 from jaxcontact.linear import ConstrainedFactor
 from jaxcontact.system.sparse import ContactNormals
 
@@ -36,6 +39,9 @@ class _Search(NamedTuple):
 
     multiplier: Array
     """Its multiplier, (C,)."""
+
+    fewest: Array
+    """Least number of pairs on the wrong side in the safeguard so far, int32."""
 
     is_repeated: Array
     """Whether the last active set was found again, bool."""
@@ -72,13 +78,14 @@ class MatrixFreeContact:
     ) -> tuple[Array, Solution]:
         """Solve the VI of a step; the iterations of the solution count active sets."""
         normals, compliance = self.factor.normals, self.compliance_scale
+        limit = self.max_active_sets + SETS_OF_SAFEGUARD[0] + SETS_OF_SAFEGUARD[1] * bound.shape[0]
         relative_tolerance = RELATIVE_TOLERANCE[str(rhs.dtype)]
 
         def violation(w: Array) -> Array:
             return normals @ w - bound
 
         def is_unfinished(search: _Search) -> Array:
-            return ~search.is_repeated & (search.steps < self.max_active_sets)
+            return ~search.is_repeated & (search.steps < limit)
 
         # The solver stops at a relative error, so gaps below it do not move a pair in or out.
         def advance(search: _Search) -> _Search:
@@ -87,17 +94,22 @@ class MatrixFreeContact:
             noise = resolution + relative_tolerance * _magnitude(normals, w)
             stays = active & (compliance * p >= -noise)
             enters = ~active & (violation(w) > noise)
-            following = stays | enters
-            return _Search(following, w, p, jnp.all(following == active), search.steps + 1)
+            wrong = (stays | enters) ^ active
+            steps, count = search.steps + 1, jnp.sum(wrong, dtype=jnp.int32)
+            is_newton = steps < self.max_active_sets
+            moved = jnp.where(is_newton | (count < search.fewest), wrong, last_of(wrong))
+            fewest = jnp.where(is_newton, search.fewest, jnp.minimum(search.fewest, count))
+            return _Search(active ^ moved, w, p, fewest, count == 0, steps)
 
         start = _Search(
             active=guess.active,
             w=jnp.zeros_like(rhs),
             multiplier=jnp.zeros_like(bound),
+            fewest=jnp.int32(bound.shape[0] + 1),
             is_repeated=jnp.bool_(False),
             steps=jnp.int32(0),
         )
-        active, w, p, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
+        active, w, p, _, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
 
         scale = _magnitude(normals, w) + resolution / relative_tolerance
         # Clipping a multiplier within the noise changes the balance of forces by as little.
@@ -106,7 +118,8 @@ class MatrixFreeContact:
         residual = jnp.max(error / jnp.maximum(scale, jnp.finfo(rhs.dtype).tiny))
         is_finite = jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(p))
         is_solved = is_repeated & (residual <= 4.0 * relative_tolerance)
-        status = jnp.where(is_solved, Status.CONVERGED, Status.NOT_CONVERGED)
+        status = jnp.where(steps > self.max_active_sets, Status.FALLBACK, Status.CONVERGED)
+        status = jnp.where(is_solved, status, Status.NOT_CONVERGED)
         status = jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32)
         is_closed = active | (-violation(w) <= relative_tolerance * scale)
         return w, Solution(clipped, is_closed, steps, status, residual)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +36,7 @@ def solve(solver, compliance, offset, guess=None, resolution=None):
     )
 
 
-@jax.jit(static_argnums=0)
+@partial(jax.jit, static_argnums=0)
 def _solve(solver, compliance, offset, resolution, guess):
     return solver.solve(compliance, offset, resolution, Guess(guess))
 
