@@ -111,10 +111,17 @@ class IterativeFactor:
         lengths = jnp.sum(normals.weights**2, axis=1)
 
         def restrict(x: Array) -> Array:
-            stretch = jnp.where(active, (normals @ x) / lengths, 0.0)
-            return x - normals.transposed_product(stretch, n)
+            # Twice: what is left along the normals is then relative to the result, not to x.
+            for _ in range(2):
+                stretch = jnp.where(active, (normals @ x) / lengths, 0.0)
+                x = x - normals.transposed_product(stretch, n)
+            return x
 
         lifted = normals.transposed_product(jnp.where(active, bound / lengths, 0.0), n)
+        # Squares of norms of 1e-20 are zero in float32: in units of a power of two of its data.
+        root = jnp.sqrt(self.preconditioner)
+        unit = _power_of_two(jnp.max(jnp.maximum(jnp.abs(root * rhs), jnp.abs(lifted / root))))
+        rhs, lifted = rhs / unit, lifted / unit
         # The right-hand side and the lifted bound may cancel: rounding is relative to both.
         terms = _norm(rhs, self.preconditioner) + _norm(lifted, 1.0 / self.preconditioner)
 
@@ -139,7 +146,7 @@ class IterativeFactor:
         error = _norm(restrict(force), self.preconditioner) / self.smallest_eigenvalue
         size = terms + _norm(w, 1.0 / self.preconditioner)
         is_accurate = error <= self.tolerance**LARGEST_ERROR * size
-        poison = jnp.where(has_ended & is_accurate, 1.0, jnp.nan).astype(rhs.dtype)
+        poison = jnp.where(has_ended & is_accurate, unit, jnp.nan)
         return w * poison, p * poison
 
     def _wanted_residual(self, terms: Array, size: Array) -> Array:
@@ -157,6 +164,11 @@ class IterativeFactor:
 def _rounding(dtype: jnp.dtype) -> float:
     """Return the relative residual that rounding leaves."""
     return ROUNDING * float(jnp.finfo(dtype).eps)
+
+
+def _power_of_two(x: Array) -> Array:
+    """Return a power of two as large as a scalar, within a factor of two; one for zero."""
+    return jnp.where(x > 0.0, jnp.ldexp(jnp.ones_like(x), jnp.frexp(x)[1]), 1.0)
 
 
 def _norm(x: Array, weights: Array) -> Array:

@@ -13,7 +13,7 @@ from support.fuzz_draw import Kind, draw, draw_kind, mesh_of
 __all__ = ["Batch", "Kind", "draw_kind", "run"]
 
 #: Cases that run at once under vmap. In larger batches, LAPACK calls of one program can wait for
-#: each other for ever in the thread pool of XLA (jaxlib 0.12, two cores).
+#: each other for ever in the thread pool of XLA (jaxlib 0.10.2, two cores).
 LANES = 10
 #: Step of the differences, relative to the values.
 STEP = 1e-5
