@@ -92,7 +92,7 @@ def identify(problem: Misfit, start: np.ndarray, iterations: int) -> tuple[np.nd
         inner_product=Weighted(jnp.ones(2)),
         iterations=iterations,
     )
-    return np.exp(np.asarray(result.control)), int(np.sum(result.history.evaluations))
+    return np.exp(np.asarray(result.control)), int(result.history.evaluations[-1])
 
 
 def laws(cells: int) -> dict[str, Any]:
