@@ -357,7 +357,7 @@ def test_constraint_holds_to_rounding_after_many_iterations():
 def test_small_numbers_are_solved_for_in_float32():
     # The squares of these norms are below the smallest number of float32.
     factor = jc.prepare(
-        make_system(jnp.float32), DT, linear_solver=jc.ConjugateGradient()
+        block(jnp.float32), DT, linear_solver=jc.ConjugateGradient()
     ).operators.problem.form.factor
     rhs = jnp.sin(jnp.arange(factor.matrix.size, dtype=jnp.float32))
     unit = jnp.float32(2.0**-80)
