@@ -18,6 +18,7 @@ from jaxcontact.contact import (
     ProjectedGaussSeidel,
     RelaxedContact,
     SemismoothNewton,
+    SmoothedContact,
     Status,
 )
 from jaxcontact.control import scenes
@@ -26,10 +27,12 @@ from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
+    PhaseMean,
     Verdict,
     check_gradient,
     derivative_report,
     directional_derivative,
+    phase_mean,
 )
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.motion.checks import SolveError
@@ -61,7 +64,9 @@ from jaxcontact.optimize import (
     stationarity,
 )
 from jaxcontact.scene import meshes
+from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.io import read_mesh
+from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
@@ -97,6 +102,7 @@ __all__ = [
     "Descent",
     "Ending",
     "Energy",
+    "Facets",
     "GradientCheck",
     "HalfSpace",
     "History",
@@ -109,6 +115,7 @@ __all__ = [
     "NewtonCG",
     "OpenBranch",
     "Optax",
+    "PhaseMean",
     "ProjectedGaussSeidel",
     "RedistributedMass",
     "RelaxedContact",
@@ -116,6 +123,7 @@ __all__ = [
     "Scene",
     "SemismoothNewton",
     "SignedDistance",
+    "SmoothedContact",
     "SolveError",
     "State",
     "StaticContact",
@@ -145,10 +153,12 @@ __all__ = [
     "energy",
     "estimate_memory",
     "export",
+    "join",
     "l2_value_and_grad",
     "load_result",
     "meshes",
     "optimize",
+    "phase_mean",
     "plot",
     "prepare",
     "read_mesh",

@@ -1,11 +1,12 @@
 """The contact problem of one time step: its solvers, and its derivative on the critical cone."""
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
-from jaxcontact.contact.form import ContactForm, contact_form
+from jaxcontact.contact.form import ContactForm
 from jaxcontact.contact.gauss_seidel import ProjectedGaussSeidel
 from jaxcontact.contact.newton import SemismoothNewton
 from jaxcontact.contact.relaxed import RelaxedContact
-from jaxcontact.contact.vi import Bound, ContactProblem, Perturbation
+from jaxcontact.contact.smoothed import SmoothedContact
+from jaxcontact.contact.vi import Bound, ContactProblem, Perturbation, contact_problem
 from jaxcontact.contact.weak import (
     AlongDirection,
     ClosedBranch,
@@ -28,8 +29,9 @@ __all__ = [
     "ProjectedGaussSeidel",
     "RelaxedContact",
     "SemismoothNewton",
+    "SmoothedContact",
     "Solution",
     "Status",
     "WeakContact",
-    "contact_form",
+    "contact_problem",
 ]

@@ -84,6 +84,10 @@ class ContactSolver(Protocol):
     is_exact: ClassVar[bool]
     """Whether contact is rigid, p g = 0; if not, `softness` enters the derivative."""
 
+    uses_compliance: ClassVar[bool]
+    """Whether the law of a pair is one of d p with d = W_ii, so that the derivative by a matrix
+    enters the law through d too."""
+
     @property
     def max_active_sets(self) -> int | None:
         """Active sets to try where contact cannot be condensed; None if the solver needs W."""
@@ -108,8 +112,13 @@ class ContactSolver(Protocol):
         """
         ...
 
-    def softness(self, multiplier: Array, separation: Array) -> Array:
-        """Return dg/dp of the contact law at p and g, (C,); zero where contact is rigid."""
+    def softness(self, compliance: Array | None, multiplier: Array) -> Array:
+        """Return -dg/dp of the contact law, (C,): zero where it is rigid, infinite where open.
+
+        Args:
+            compliance: d = diag W, (C,); None unless the solver `uses_compliance`.
+            multiplier: p, (C,).
+        """
         ...
 
 
@@ -157,14 +166,16 @@ def solve_compliance(compliance: Array, active: Array, softness: Array | None, r
     scale = jax.lax.rsqrt(jnp.where(active, jnp.diagonal(compliance), 0.0) + diagonal)
     matrix = jnp.where(inside, compliance, 0.0) * scale[:, None] * scale[None, :]
     matrix = matrix + jnp.diag(diagonal * scale**2)
-    shift = rank_shift(compliance)
-    factor = jax.scipy.linalg.cho_factor(
-        matrix + shift * jnp.eye(scale.size, dtype=scale.dtype), lower=True
-    )
-    first = jax.scipy.linalg.cho_solve(factor, scale * rhs)
+    return scale * solve_unit_diagonal(matrix, scale * rhs)
+
+
+def solve_unit_diagonal(matrix: Array, rhs: Array) -> Array:
+    """Return x with `matrix` x = rhs, (C,), for a positive semidefinite matrix of diagonal one."""
+    shift = rank_shift(matrix) * jnp.eye(rhs.size, dtype=rhs.dtype)
+    factor = jax.scipy.linalg.cho_factor(matrix + shift, lower=True)
+    first = jax.scipy.linalg.cho_solve(factor, rhs)
     # Once more for the remainder, which takes the shift out again.
-    rest = scale * rhs - matrix @ first
-    return scale * (first + jax.scipy.linalg.cho_solve(factor, rest))
+    return first + jax.scipy.linalg.cho_solve(factor, rhs - matrix @ first)
 
 
 def last_of(pairs: Array) -> Array:

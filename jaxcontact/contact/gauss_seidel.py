@@ -56,6 +56,7 @@ class ProjectedGaussSeidel:
     """A step that needs more sweeps ends as not converged."""
 
     is_exact: ClassVar[bool] = True
+    uses_compliance: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the option, which is never traced.
@@ -91,6 +92,6 @@ class ProjectedGaussSeidel:
             compliance, offset, resolution, multiplier, sweeps, jnp.bool_(False)
         )
 
-    def softness(self, multiplier: Array, separation: Array) -> Array:
+    def softness(self, compliance: Array | None, multiplier: Array) -> Array:
         """Return zero: contact is rigid."""
         return jnp.zeros_like(multiplier)

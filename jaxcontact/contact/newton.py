@@ -59,6 +59,7 @@ class SemismoothNewton:
     """Gauss-Seidel sweeps, if that did not help either, before a step ends as not converged."""
 
     is_exact: ClassVar[bool] = True
+    uses_compliance: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the options, which are never traced.
@@ -144,6 +145,6 @@ class SemismoothNewton:
         solution = complementarity.finish(compliance, offset, resolution, p, steps, is_fallback)
         return solution._replace(workspace=pivoted)
 
-    def softness(self, multiplier: Array, separation: Array) -> Array:
+    def softness(self, compliance: Array | None, multiplier: Array) -> Array:
         """Return zero: contact is rigid."""
         return jnp.zeros_like(multiplier)

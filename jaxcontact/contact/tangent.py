@@ -4,6 +4,7 @@ With the active set A of the solution held fixed, (w, p) is linear in the data,
 
     D dw + N^T dp = dr - dD w - dN^T p,    (N dw - s dp)_i = (db - dN w)_i on A,    dp_i = 0 else.
 
+A smooth law g(d p), d = diag W, has all pairs in A, s = -dg/dp, and s p dd / d beside db.
 `weak.py` names the choices of A at weak contact, `critical_cone.py` solves for the one-sided
 derivative. Source: paper, Theorem 4.20.
 """
@@ -41,10 +42,11 @@ def _solve_forward(
     weights: Array,
     rhs: Array,
     bound: Array,
+    compliance: Array | None,
     fixed: Fixed,
 ) -> tuple[Array, Solution]:
     """Solve the VI; see `ContactProblem.solve`."""
-    del weak_contact, values, weights
+    del weak_contact, values, weights, compliance
     assert fixed.resolution is not None
     assert fixed.guess is not None
     return fixed.form.solve(rhs, bound, fixed.resolution, fixed.guess)
@@ -53,11 +55,15 @@ def _solve_forward(
 def _solve_forward_jvp(arguments, tangents):
     weak_contact, *primals = arguments
     _, *tangents = tangents
-    values, weights, _, bound, fixed = primals
+    values, weights, _, _, compliance, fixed = primals
     w, solution = solve_forward(weak_contact, *primals)
     data_dot = _linearized_data(fixed, w, solution.multiplier, tangents)
     if weak_contact.is_linear or not fixed.form.contact_solver.is_exact:
-        pairs, softness = linear_contact(weak_contact, weights, bound, fixed, w, solution)
+        pairs, softness = linear_contact(weak_contact, compliance, fixed, solution)
+        compliance_dot = tangents[4]
+        if softness is not None and not isinstance(compliance_dot, SymbolicZero | None):
+            rate = by_compliance(compliance, softness, solution.multiplier)
+            data_dot = data_dot[0], data_dot[1] + rate * compliance_dot
         w_dot, p_dot = solve_on_cone(values, weights, fixed, pairs, softness, *data_dot)
     else:
         w_dot, p_dot = _solve_critical_cone(values, weights, fixed, solution, *data_dot)
@@ -70,22 +76,21 @@ solve_forward = lasting_jvp(_solve_forward, _solve_forward_jvp)
 
 
 def linear_contact(
-    weak_contact: WeakContact,
-    weights: Array,
-    bound: Array,
-    fixed: Fixed,
-    w: Array,
-    solution: Solution,
+    weak_contact: WeakContact, compliance: Array | None, fixed: Fixed, solution: Solution
 ) -> tuple[Array, Array | None]:
     """Return the pairs (C,) bool and the softness (C,) or None of the linearised contact law."""
     contact_solver = fixed.form.contact_solver
     if contact_solver.is_exact:
         return _not_open(fixed, weak_contact.equality_set(solution)), None
-    separation = bound - ContactNormals(weights, fixed.unknowns) @ w
-    softness = contact_solver.softness(solution.multiplier, separation)
+    softness = contact_solver.softness(compliance, solution.multiplier)
     # Infinitely soft pairs are open; a product with infinity would be NaN.
     pairs = _not_open(fixed, jnp.isfinite(softness))
     return pairs, jnp.where(pairs, softness, 0.0)
+
+
+def by_compliance(compliance: Array, softness: Array, multiplier: Array) -> Array:
+    """Return -dg/dd of a law g(d p), (C,), from s = -dg/dp: s p / d."""
+    return softness * multiplier / compliance
 
 
 def _not_open(fixed: Fixed, pairs: Array) -> Array:
@@ -96,7 +101,7 @@ def _linearized_data(
     fixed: Fixed, w: Array, multiplier: Array, tangents: Sequence
 ) -> tuple[Array, Array]:
     """Return dr - dD w - dN^T p, (n,), and db - dN w, (C,)."""
-    values_dot, weights_dot, rhs_dot, bound_dot, _ = tangents
+    values_dot, weights_dot, rhs_dot, bound_dot, *_ = tangents
     rhs_dot, bound_dot = instantiate(rhs_dot), instantiate(bound_dot)
     if not isinstance(values_dot, SymbolicZero):
         rhs_dot = rhs_dot - SymmetricMatrix(values_dot, fixed.columns) @ w

@@ -26,10 +26,12 @@ from jax import Array
 
 from jaxcontact.contact.adjoint import solve_with_adjoint
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
-from jaxcontact.contact.form import ContactForm
+from jaxcontact.contact.form import ContactForm, contact_form
+from jaxcontact.contact.pair_compliance import pair_compliance
 from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
+from jaxcontact.linear import Factor
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -84,6 +86,9 @@ class ContactProblem:
     perturbation: Perturbation = NO_PERTURBATION
     """What the VI is perturbed by."""
 
+    compliance: Array | None = None
+    """d = diag(N D^-1 N^T), (C,) [1/kg], differentiable; None if the law does not use it."""
+
     weak_contact: WeakContact | None = field(default=None, metadata={"static": True})
     """What the derivative means where a pair is in weak contact. None is Algorithm 1, by the
     `jax.custom_vjp` of the step: reverse mode. A named treatment has forward mode too."""
@@ -118,7 +123,7 @@ class ContactProblem:
         fixed = Fixed(
             self.matrix.columns, self.normals.unknowns, self.form, bound.resolution, guess, is_open
         )
-        data = (self.matrix.values, self.normals.weights, rhs, value, fixed)
+        data = (self.matrix.values, self.normals.weights, rhs, value, self.compliance, fixed)
         if self.weak_contact is None:
             velocity, solution = solve_with_adjoint(*data)
         else:
@@ -147,3 +152,20 @@ class ContactProblem:
         return velocity, Solution(
             nothing, guess.active, jnp.int32(0), status, zero, separation=nothing
         )
+
+
+def contact_problem(
+    matrix: SymmetricMatrix,
+    normals: ContactNormals,
+    factor: Factor,
+    contact_solver: ContactSolver,
+) -> ContactProblem:
+    """Return the contact problem of a factorised matrix.
+
+    Raises:
+        ValueError: as `contact_form`.
+    """
+    form = contact_form(factor, contact_solver)
+    uses_compliance = contact_solver.uses_compliance and normals.count > 0
+    compliance = pair_compliance(matrix, normals, factor) if uses_compliance else None
+    return ContactProblem(matrix, normals, form, compliance=compliance)

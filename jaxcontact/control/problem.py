@@ -9,11 +9,10 @@ representative, so that norms and slopes of gradients cost no product with the m
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +24,10 @@ from jaxcontact.control.inner_product import L2, InnerProduct, lumped_l2
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.system.system import System
 from jaxcontact.transforms.options import check_option
+from jaxcontact.transforms.trees import as_partial
 
 #: A predicted decrease below this times the value is rounding error.
 ROUNDING = 1e-16
-
-R = TypeVar("R")
 
 
 @runtime_checkable
@@ -137,7 +135,10 @@ class Problem:
     @cached_property
     def is_compiled(self) -> bool:
         """Whether all parts are pytrees, so that their arrays can be arguments of jit."""
-        return all(_is_pytree(part) for part in (self.objective, self.controls, self.product))
+        return not any(
+            jax.tree_util.all_leaves([part])
+            for part in (self.objective, self.controls, self.product)
+        )
 
     def evaluate(self, parameters: Array) -> Point:
         """Return the point; its value is infinite if a time step fails or if it is not finite."""
@@ -182,17 +183,6 @@ class Problem:
 def identity(parameters: Array) -> Array:
     """Return the control itself."""
     return parameters
-
-
-def as_partial(function: Callable[[Array], R]) -> Callable[[Array], R]:
-    """Return a bound method of a pytree as `Partial`, so that its arrays are arguments of jit."""
-    if inspect.ismethod(function) and _is_pytree(function.__self__):
-        return Partial(function.__func__, function.__self__)
-    return function
-
-
-def _is_pytree(value: object) -> bool:
-    return not jax.tree_util.all_leaves([value])
 
 
 def _product_of(

@@ -1,4 +1,4 @@
-"""Ready-made scenes: the half disc of the paper's section 5 and its optimal control problem."""
+"""Ready-made scenes: the half disc of the paper's section 5 and its control problem, two bodies."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper, prepare
 from jaxcontact.scene import meshes
+from jaxcontact.scene.facets import Facets
+from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.obstacle import HalfSpace
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.system import System, discretize
 
 RADIUS = 15.0
+#: Half a turn in the plane.
+UPSIDE_DOWN = np.diag([-1.0, -1.0])
+RUBBER = KelvinVoigt(young=1e8, poisson=0.3, bulk_viscosity=1e4, shear_viscosity=1e4, density=1.0)
 
 
 def half_disc(h: float = RADIUS / 8, gap: float = 0.8) -> Scene:
@@ -34,13 +39,76 @@ def half_disc(h: float = RADIUS / 8, gap: float = 0.8) -> Scene:
     """
     return Scene(
         mesh=meshes.half_disc(RADIUS, h=h),
-        material=KelvinVoigt(
-            young=1e8, poisson=0.3, bulk_viscosity=1e4, shear_viscosity=1e4, density=1.0
-        ),
+        material=RUBBER,
         clamped=("clamped",),
         contact={
             "contact": HalfSpace(point=np.array([0.0, -RADIUS - gap]), normal=np.array([0.0, 1.0]))
         },
+    )
+
+
+def two_half_discs(h: float = RADIUS / 8, gap: float = 0.8) -> Scene:
+    """Return the half disc of the paper above its mirror image, each clamped at its flat side.
+
+    The bodies are "upper", the contact set, and "lower"; under mirrored loads the upper one moves
+    as `half_disc` does. Source: paper, Example 4.22.
+
+    Args:
+        h: mesh size, [m].
+        gap: distance of each body from the plane between them, [m].
+    """
+    body = meshes.half_disc(RADIUS, h=h)
+    below = np.array([0.0, -2.0 * (RADIUS + gap)])
+    return Scene(
+        mesh=join({"upper": body, "lower": body.moved(UPSIDE_DOWN, below)}),
+        material=RUBBER,
+        clamped=("upper/clamped", "lower/clamped"),
+        contact={"upper/contact": Facets("lower/contact", along=np.array([0.0, -1.0]))},
+    )
+
+
+def two_discs(h: float = 0.1, gap: float = 0.1) -> Scene:
+    """Return two free elastic discs on top of each other, of other sizes, materials and meshes.
+
+    "large": radius 1 m, E = 1 Pa, density 1 kg/m^2, around the origin; "small", the contact set:
+    radius 0.7 m, E = 3 Pa, density 1.5 kg/m^2, above it; nu = 0.3, no viscosity. Elastic waves keep
+    a part of the energy of an impact. Source: Gerl, Zippelius, Phys. Rev. E 59 (1999).
+
+    Args:
+        h: mesh size, [m].
+        gap: distance of the discs, [m].
+    """
+    large = meshes.disc(1.0, h=h).moved(UPSIDE_DOWN)
+    small = meshes.disc(0.7, h=h).moved(translation=np.array([0.0, 1.7 + gap]))
+    return Scene(
+        mesh=join({"large": large, "small": small}),
+        material={
+            "large": KelvinVoigt(young=1.0, poisson=0.3, density=1.0),
+            "small": KelvinVoigt(young=3.0, poisson=0.3, density=1.5),
+        },
+        contact={"small/contact": Facets("large/contact")},
+    )
+
+
+def bars(n_resting: int = 1, h: float = 0.02, gap: float = 1e-3) -> Scene:
+    """Return Newton's cradle: a row of equal bars that touch, behind a gap from a first one.
+
+    Length, Young's modulus and density are one (SI units), nu = 0. Thrown to the right with the
+    speed v, the first bar "bar0" comes to rest with a contact force of v / 2 over the time 2, and
+    the last bar leaves with v, n_resting + 1 after the impact. Source: Saint-Venant, J. Math. Pures
+    Appl. 12 (1867).
+
+    Args:
+        n_resting: number of bars that rest, 1 or more.
+        h: length of a cell, [m].
+        gap: distance between the first bar and the others, [m].
+    """
+    places = [0.0, *(k + gap for k in range(1, n_resting + 1))]
+    bar = meshes.interval(1.0, h=h)
+    return Scene(
+        mesh=join({f"bar{k}": bar.moved(translation=[x]) for k, x in enumerate(places)}),
+        material=KelvinVoigt(young=1.0, poisson=0.0),
+        contact={f"bar{k}/left": Facets(f"bar{k - 1}/right") for k in range(1, n_resting + 1)},
     )
 
 
@@ -133,7 +201,7 @@ def half_disc_control(
     stepper = prepare(system, dt, **prepare_options)
     # Before the reference takes as much.
     check_run_memory(stepper, steps)
-    down = jnp.zeros(system.dimension, dtype).at[-1].set(-1.0)
+    down = jnp.asarray(-np.eye(system.dimension)[-1], dtype)
     reference = jnp.broadcast_to(down, (steps, system.n_nodes, system.dimension))
     return ControlProblem(
         scene=scene,

@@ -20,12 +20,17 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from jaxcontact.derivative.phase import phase_dependence, phase_words
 from jaxcontact.derivative.verdict import Verdict, verdict_of_orders
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.transforms.precision import in_full_precision
 
 #: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
 NOISE = 64.0
+
+#: Nearby points at which the noise of J is measured, in rounding errors of u, and the power of a
+#: rounding error that it cannot exceed: more is a jump.
+NEARBY, LARGEST_NOISE = (-16.0, -4.0, 4.0, 16.0), 0.6
 
 #: Remainders that fall by less than this order over all steps are those of a jump.
 NO_ORDER = 0.5
@@ -68,6 +73,14 @@ class GradientCheck:
     verdict: Verdict
     """What follows."""
 
+    closing_speed: float | None
+    """Speed at which a gap closes in the step before a touch, [m/s]; None if the objective holds no
+    stepper, or nothing touches."""
+
+    phase_spread: float | None
+    """Standard deviation of the gradient over the phases of the touch relative to their mean; None
+    like above. See `phase_mean` and `SmoothedContact`."""
+
     @property
     def is_right(self) -> bool:
         """Whether the gradient is the derivative, on both sides and along every direction."""
@@ -105,6 +118,8 @@ class GradientCheck:
                 f"weak contact on {self.weak_contacts} (step, pair); "
                 f"{self.contact_changes} change within the largest step"
             )
+        if self.closing_speed is not None and self.phase_spread is not None:
+            lines += phase_words(self.closing_speed, self.phase_spread)
         if self.verdict is Verdict.RIGHT:
             lines.append(f"J' d is exact to {np.max(self.resolution):.0e} or better")
         if self.verdict is Verdict.UNDECIDED:
@@ -131,14 +146,16 @@ def check_gradient(
     """Check the gradient of an objective along itself and along random directions.
 
     Args:
-        objective: maps u to a scalar.
+        objective: maps u to a scalar. If it is a pytree that holds a stepper, or a bound method of
+            one, the check also says how much the gradient depends on the phase of the touch.
         u: an array, or a pytree of arrays such as the parameters of a network.
         gradient: what to check, shaped like u; default `jax.grad(objective)(u)`.
         directions: number of random directions beside the gradient.
         step: largest step, relative to the norm of every array in u (absolute for a zero array).
         n_steps: number of steps, each half of the one before, at least 2.
         seed: of the random directions.
-        trajectory: maps u to the trajectory, to count weak contact.
+        trajectory: maps u to the trajectory, to count weak contact and to find the closing speed;
+            without it that is the speed of the free flight from rest.
 
     Returns:
         Remainders, orders and a verdict; print it.
@@ -181,7 +198,11 @@ def check_gradient(
     remainder = np.abs(np.stack([plus - value - linear, minus - value + linear], axis=1))
     central = np.abs((plus - minus) / (2.0 * steps) - derivative[:, None])
     magnitude = max(abs(value), float(np.max(np.abs(derivative))))
-    noise = NOISE * float(np.finfo(flat.dtype).eps) * magnitude
+    eps = float(np.finfo(flat.dtype).eps)
+    nearby = (float(evaluate(flat + x * eps * rows[-1])) - x * eps * derivative[-1] for x in NEARBY)
+    measured = max(abs(x - value) for x in nearby)
+    is_rounding = measured <= eps**LARGEST_NOISE * magnitude
+    noise = max(NOISE * eps * magnitude, 4.0 * measured if is_rounding else 0.0)
     order = np.array([[_order(side, noise) for side in both] for both in remainder])
     quotients = (plus[:, -1] - value) / steps[-1], (value - minus[:, -1]) / steps[-1]
     weak, changes = _count_contacts(trajectory, unravel, flat, step * rows)
@@ -199,6 +220,7 @@ def check_gradient(
         verdict = Verdict.JUMP
     else:
         verdict = verdict_of_orders(order, resolution, quotients, noise / steps[-1], weak)
+    speed, spread = phase_dependence(objective, u, None if trajectory is None else trajectory(u))
     return GradientCheck(
         value=value,
         steps=steps,
@@ -210,6 +232,8 @@ def check_gradient(
         weak_contacts=weak,
         contact_changes=changes,
         verdict=verdict,
+        closing_speed=speed,
+        phase_spread=spread,
     )
 
 

@@ -21,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.contact import ClosedBranch, Status, WeakContact
+from jaxcontact.contact import ClosedBranch, SemismoothNewton, Status, WeakContact
+from jaxcontact.derivative.phase import moved, phase_spread, phase_words
 from jaxcontact.derivative.weak import contact_sizes, margins, sensitivity
 from jaxcontact.motion.checks import raise_if_failed
 from jaxcontact.motion.simulate import simulate
-from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
+from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_contact, with_perturbation
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -74,6 +75,17 @@ class DerivativeReport:
     """xi_i of the closed branch beyond that of the open one on the weak contacts, (W,) [cost per
     m]."""
 
+    closing_speed: float
+    """Speed at which a gap closes in the step before a touch, [m/s]; zero if nothing touches."""
+
+    phase_spread: float
+    """Standard deviation of the derivative over the phases of the touch relative to their mean;
+    zero if nothing touches. See `phase_mean` and `SmoothedContact`."""
+
+    distance: float
+    """Distance of the motion from that with exact contact, relative, in the l2 norm over nodes and
+    time; zero if contact is exact."""
+
     @property
     def is_differentiable(self) -> bool:
         """Whether the motion has a derivative, not only one-sided ones."""
@@ -101,6 +113,10 @@ class DerivativeReport:
             signs = f"(N p) = {cone:.3e}, xi = {polar:.3e}: {_kind(cone, polar)}"
             where = " of the predictor" if problem else ""
             lines.append(f"  step {step}, node {node}{where}: {signs}")
+        if self.distance:
+            lines.append(f"smooth contact: {self.distance:.1e} from the motion of exact contact")
+        if self.closing_speed:
+            lines += phase_words(self.closing_speed, self.phase_spread)
         if self.duality_gap > MODES_DIFFER:
             lines.append("WRONG: forward and reverse mode of the cost differ.")
         elif self.is_differentiable:
@@ -142,16 +158,20 @@ def derivative_report(
     n_steps = trajectory.status.shape[0]
 
     def perturbed_cost(
-        perturbation: StepPerturbation, weak_contact: WeakContact | None = None
+        perturbation: StepPerturbation,
+        weak_contact: WeakContact | None = None,
+        distance: Array | float = 0.0,
     ) -> Array:
-        perturbed = with_perturbation(stepper, perturbation)
+        perturbed = with_perturbation(moved(stepper, distance), perturbation)
         options = {"steps": n_steps, "initial": initial, "weak_contact": weak_contact}
         return cost(simulate(perturbed, control, **options))
 
     closed = sensitivity(perturbed_cost, stepper, n_steps)
     opened = sensitivity(perturbed_cost, stepper, n_steps, trajectory.contact.weak)
     normal_product = jax.vmap(lambda p: stepper.system.normals @ p)
-    on_strong = np.abs(np.asarray(normal_product(closed.load))) * np.asarray(trajectory.strong)
+    # A smooth law gives way by its softness: there N p does not vanish.
+    is_rigid = np.asarray(trajectory.strong) & stepper.contact_solver.is_exact
+    on_strong = np.abs(np.asarray(normal_product(closed.load))) * is_rigid
     size = float(jnp.max(jnp.abs(closed.load)))
 
     direction = jax.random.normal(jax.random.key(seed), closed.load.shape, closed.load.dtype)
@@ -162,6 +182,12 @@ def derivative_report(
     _, forward = jax.jvp(along, (jnp.zeros_like(direction),), (direction,))
     reverse = jnp.vdot(closed.load, direction)
     scale = jnp.linalg.norm(closed.load) * jnp.linalg.norm(direction)
+
+    speed, spread = float(trajectory.closing_speed), 0.0
+    if speed > 0.0:
+        nothing = StepPerturbation(jnp.zeros_like(closed.load))
+        by_load = jax.grad(perturbed_cost)
+        spread = float(phase_spread(lambda x: by_load(nothing, None, x).load, speed))
 
     weak = np.asarray(trajectory.contact.weak)
     margin = np.where(weak, 0.0, margins(trajectory, contact_sizes(stepper, trajectory)))
@@ -178,7 +204,23 @@ def derivative_report(
         margin=float(np.min(margin, initial=np.inf)),
         cone=-np.asarray(opened.push)[weak],
         polar=np.asarray(opened.gap - closed.gap)[weak],
+        closing_speed=speed,
+        phase_spread=spread,
+        distance=_distance_from_exact(stepper, trajectory, control, initial),
     )
+
+
+def _distance_from_exact(
+    stepper: Stepper, trajectory: Trajectory, control: Array | None, initial: State | None
+) -> float:
+    """Return the distance of a motion from that with exact contact, relative."""
+    if stepper.contact_solver.is_exact:
+        return 0.0
+    exact = with_contact(stepper, SemismoothNewton())
+    steps = trajectory.status.shape[0]
+    motion = simulate(exact, control, steps=steps, initial=initial).displacement
+    size = jnp.linalg.norm(motion - motion[:1])
+    return float(jnp.linalg.norm(trajectory.displacement - motion) / jnp.where(size, size, 1.0))
 
 
 def _kind(cone: float, polar: float) -> str:

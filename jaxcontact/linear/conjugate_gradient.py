@@ -70,6 +70,7 @@ class IterativeFactor:
     """Iterations of each of the two runs of a solve; NaN if the second does not end in them."""
 
     @property
+    @jax.jit
     def is_positive(self) -> Array:
         """True if diagonal and smallest eigenvalue are positive, () bool.
 
@@ -176,6 +177,15 @@ def _norm(x: Array, weights: Array) -> Array:
 
 
 @jax.jit
+def _precondition(matrix: SymmetricMatrix, normals: ContactNormals) -> Array:
+    """Return one over the mean diagonal entry of each contact node, else over its own, (n,)."""
+    diagonal, unknowns = matrix.diagonal(), jnp.asarray(normals.unknowns)
+    # The components of a contact node share one number, so that the projection commutes.
+    mean = jnp.mean(diagonal[unknowns], axis=1, keepdims=True)
+    return 1.0 / diagonal.at[unknowns].set(jnp.broadcast_to(mean, unknowns.shape))
+
+
+@jax.jit
 def _find_smallest_eigenvalue(factor: IterativeFactor) -> Array:
     """Return the Rayleigh quotient of D^-1 M^(1/2) x for a random x, scalar.
 
@@ -191,7 +201,7 @@ def _find_smallest_eigenvalue(factor: IterativeFactor) -> Array:
 class ConjugateGradient:
     """Solve every step by preconditioned conjugate gradients; no factor is stored.
 
-    Works with `SemismoothNewton` and with contact sets in which no node occurs twice.
+    Works with `SemismoothNewton`, rigid obstacles, and contact sets in which no node occurs twice.
     """
 
     tolerance: float = 1e-12
@@ -233,33 +243,31 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if a node belongs to two contact pairs, or if the values are concrete and
-                so ill-conditioned that no solve could succeed.
+            ValueError: if an unknown belongs to two contact pairs, as with two bodies, or if the
+                values are concrete and so ill-conditioned that no solve could succeed.
         """
         unknowns = np.asarray(normals.unknowns)
         if np.unique(unknowns).size != unknowns.size:
             raise ValueError(
-                "ConjugateGradient needs contact sets without common nodes; use "
-                "linear_solver=jc.NestedDissection()"
+                "ConjugateGradient needs contact sets without common nodes, against rigid "
+                "obstacles and not other bodies; use linear_solver=jc.NestedDissection()"
             )
         floor = 8.0 * float(jnp.finfo(matrix.values.dtype).eps)
-        diagonal = matrix.diagonal()
-        # The components of a contact node share one number, so that the projection commutes.
-        mean = jnp.mean(diagonal[unknowns], axis=1, keepdims=True)
-        diagonal = diagonal.at[unknowns].set(jnp.broadcast_to(mean, unknowns.shape))
+        preconditioner = _precondition(matrix, normals)
         tolerance = max(self.tolerance, floor)
         # An infinite eigenvalue asks for no more than the tolerance.
-        unknown = jnp.full((), jnp.inf, diagonal.dtype)
+        dtype = preconditioner.dtype
+        unknown = jnp.asarray(np.inf, dtype)
         factor = IterativeFactor(
-            matrix, normals, 1.0 / diagonal, unknown, tolerance, self.max_iterations
+            matrix, normals, preconditioner, unknown, tolerance, self.max_iterations
         )
         smallest = _find_smallest_eigenvalue(factor)
-        least = _rounding(diagonal.dtype) / tolerance**LARGEST_ERROR
-        if not isinstance(smallest, Tracer) and 0.0 < smallest < least:
+        least = _rounding(dtype) / tolerance**LARGEST_ERROR
+        if not isinstance(smallest, Tracer) and 0.0 < float(smallest) < least:
             raise ValueError(
-                f"the matrix has a condition of about {1.0 / smallest:.0e} after scaling, "
+                f"the matrix has a condition of about {1.0 / float(smallest):.0e} after scaling, "
                 f"{1.0 / least:.0e} is the most that ConjugateGradient(tolerance={self.tolerance}) "
-                f"solves in {diagonal.dtype}; use linear_solver=jc.NestedDissection() or a "
+                f"solves in {dtype}; use linear_solver=jc.NestedDissection() or a "
                 "smaller dt"
             )
         return replace(factor, smallest_eigenvalue=smallest)

@@ -29,6 +29,7 @@ class DenseFactor:
     """N D^-1 N^T, (C, C)."""
 
     @property
+    @jax.jit
     def is_positive(self) -> Array:
         """True if D is positive definite, () bool: the Cholesky factor of another one is NaN."""
         return jnp.all(jnp.isfinite(self.inverse))
@@ -66,19 +67,24 @@ class Dense:
             normals: N, (C, n).
             coordinates: not used.
         """
-        n = matrix.size
-        dense = matrix.to_dense()
-        # Jacobi scaling first: it makes the inverse of a badly scaled matrix accurate.
-        scale = 1.0 / jnp.sqrt(jnp.diagonal(dense))
-        identity = jnp.eye(n, dtype=dense.dtype)
-        factor = jax.scipy.linalg.cho_factor(scale[:, None] * dense * scale[None, :], lower=True)
-        inverse = jax.scipy.linalg.cho_solve(factor, identity)
-        inverse = scale[:, None] * (0.5 * (inverse + inverse.T)) * scale[None, :]
-        response = jnp.sum(normals.weights[:, :, None] * inverse[normals.unknowns], axis=1)
-        compliance = jnp.sum(normals.weights[None] * response[:, normals.unknowns], axis=2)
-        return DenseFactor(inverse, response, 0.5 * (compliance + compliance.T))
+        del coordinates
+        return _invert(matrix, normals)
 
     def bytes_needed(self, size: int, dimension: int, itemsize: int) -> float:
         """Return the memory of the matrix, its Cholesky factor and its inverse, [bytes]."""
         del dimension
         return 3.0 * itemsize * size**2
+
+
+@jax.jit
+def _invert(matrix: SymmetricMatrix, normals: ContactNormals) -> DenseFactor:
+    dense = matrix.to_dense()
+    # Jacobi scaling first: it makes the inverse of a badly scaled matrix accurate.
+    scale = 1.0 / jnp.sqrt(jnp.diagonal(dense))
+    identity = jnp.eye(matrix.size, dtype=dense.dtype)
+    factor = jax.scipy.linalg.cho_factor(scale[:, None] * dense * scale[None, :], lower=True)
+    inverse = jax.scipy.linalg.cho_solve(factor, identity)
+    inverse = scale[:, None] * (0.5 * (inverse + inverse.T)) * scale[None, :]
+    response = jnp.sum(normals.weights[:, :, None] * inverse[normals.unknowns], axis=1)
+    compliance = jnp.sum(normals.weights[None] * response[:, normals.unknowns], axis=2)
+    return DenseFactor(inverse, response, 0.5 * (compliance + compliance.T))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.system import System
+from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced, poison_unless
 
 #: An initial state may reach into an obstacle by so many rounding errors of the gap: a state that
@@ -55,7 +58,7 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
     if initial is None:
-        rest = jnp.zeros(shape, system.dtype)
+        rest = jnp.asarray(np.zeros(shape, system.dtype))
         initial = State(rest, rest)
     for name in ("displacement", "velocity"):
         value = getattr(initial, name)
@@ -68,21 +71,18 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
         jnp.asarray(initial.displacement, system.dtype), jnp.asarray(initial.velocity, system.dtype)
     )
     if is_traced((system, state)):
-        is_held = jnp.stack(
-            [~jnp.any(_moved(system, x)) for x in (state.displacement, state.velocity)]
-        )
-        is_outside = jnp.all(_penetration(system, state.displacement) <= 0.0)
-        return poison_unless(jax.lax.stop_gradient(jnp.all(is_held) & is_outside), state)
+        return _poison_inadmissible(system, state)
     # Concrete values stay concrete, also where the caller is under jit.
     with jax.ensure_compile_time_eval():
-        for name in ("displacement", "velocity"):
-            moved = np.flatnonzero(_moved(system, getattr(state, name)))
-            if moved.size:
-                raise ValueError(
-                    f"initial.{name} is not zero on {moved.size} clamped nodes, first "
-                    f"{moved[:5].tolist()}"
-                )
-        depth = np.asarray(_penetration(system, state.displacement))
+        wrong = jax.tree.map(np.asarray, _find_wrong(system, state))
+    for name in ("displacement", "velocity"):
+        moved = np.flatnonzero(getattr(wrong, name))
+        if moved.size:
+            raise ValueError(
+                f"initial.{name} is not zero on {moved.size} clamped nodes, first "
+                f"{moved[:5].tolist()}"
+            )
+    depth = wrong.depth
     if np.any(depth > 0.0):
         deepest = int(np.argmax(depth))
         raise ValueError(
@@ -91,6 +91,37 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
             "m; move the obstacle or give an initial displacement with an open gap"
         )
     return state
+
+
+class _Wrong(NamedTuple):
+    """Where a state cannot be an initial one."""
+
+    displacement: Array
+    """Clamped nodes that are displaced, (N,) bool."""
+
+    velocity: Array
+    """Clamped nodes that move, (N,) bool."""
+
+    depth: Array
+    """Depth of each pair in the obstacle, (C,) [m]; zero up to rounding."""
+
+
+@in_full_precision
+@jax.jit
+def _find_wrong(system: System, state: State) -> _Wrong:
+    return _Wrong(
+        _moved(system, state.displacement),
+        _moved(system, state.velocity),
+        _penetration(system, state.displacement),
+    )
+
+
+@in_full_precision
+@jax.jit
+def _poison_inadmissible(system: System, state: State) -> State:
+    wrong = jax.lax.stop_gradient(_find_wrong(system, state))
+    is_held = ~jnp.any(wrong.displacement) & ~jnp.any(wrong.velocity)
+    return poison_unless(is_held & jnp.all(wrong.depth <= 0.0), state)
 
 
 def _moved(system: System, values: Array) -> Array:

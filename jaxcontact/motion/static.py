@@ -24,9 +24,10 @@ from jaxcontact.contact import Bound, ContactProblem, ContactSolver, Solution, S
 from jaxcontact.linear import LinearSolver
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.stepper import choose_solvers, factorize
-from jaxcontact.schemes.mass_redistribution import connected_bodies, rigid_fields
+from jaxcontact.schemes.mass_redistribution import rigid_fields
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.block_matrix import BlockMatrix, from_symmetric
+from jaxcontact.system.bodies import body_numbers
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import poison_unless
@@ -121,7 +122,7 @@ def _solve(system: System, problem: ContactProblem, load: Array) -> tuple[Array,
 def _rigid_motions(system: System) -> Array:
     """Return the rigid motions of the bodies without a clamped node, (n, r)."""
     d, free = system.dimension, np.asarray(system.free_nodes)
-    body = connected_bodies(system)
+    body = body_numbers(system)
     held = np.unique(np.delete(body, free))
     motions = [jnp.zeros((system.n_nodes, d, 0), system.dtype)]
     for number in np.setdiff1d(np.unique(body), held):

@@ -16,7 +16,7 @@ from jaxcontact.contact import (
     ContactSolver,
     Perturbation,
     SemismoothNewton,
-    contact_form,
+    contact_problem,
 )
 from jaxcontact.linear import Factor, LinearSolver, check_memory, choose_linear_solver
 from jaxcontact.schemes import ContactImplicit, Operators, Scheme
@@ -92,7 +92,12 @@ class Stepper:
     @property
     def contact_solver(self) -> ContactSolver:
         """How the contact problem of a step is solved."""
-        return self.operators.problem.contact_solver
+        return self.contact_problem.contact_solver
+
+    @property
+    def contact_problem(self) -> ContactProblem:
+        """The contact problem whose solution is the contact at the end of a step."""
+        return self.operators.problem
 
     def __repr__(self) -> str:
         """Return the choices that were made, without arrays."""
@@ -188,7 +193,7 @@ def factorize(
         _unknown_coordinates(system),
     )
     _check_factor(factor)
-    return ContactProblem(matrix, system.normals, contact_form(factor, contact_solver))
+    return contact_problem(matrix, system.normals, factor, contact_solver)
 
 
 def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:
@@ -207,7 +212,7 @@ def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:
 
     def change(number: int, problem: ContactProblem) -> ContactProblem:
         del number
-        return replace(problem, form=contact_form(problem.form.factor, contact_solver))
+        return contact_problem(problem.matrix, problem.normals, problem.form.factor, contact_solver)
 
     return exchange(
         tree, Stepper, lambda stepper: replace(stepper, operators=stepper.operators.changed(change))

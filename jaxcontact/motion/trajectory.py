@@ -113,6 +113,27 @@ class Trajectory:
         return self.active & ~self.weak
 
     @property
+    def closing_speed(self) -> Array:
+        """Largest speed at which a pair closes its gap before a touch, scalar [m/s].
+
+        Of the four steps before: a smooth contact law slows a pair down before it counts as closed.
+        Zero if nothing touches after the first step.
+
+        Raises:
+            ValueError: if not every state is recorded (`save_every`).
+        """
+        if self.gap.shape[-2] != self.contact_impulse.shape[-2] + 1:
+            raise ValueError(
+                "closing_speed needs the gap of every step; simulate with save_every=1"
+            )
+        is_closed = jnp.swapaxes(self.active, -2, -1)
+        touches = is_closed[..., 1:] & ~is_closed[..., :-1]
+        later = jnp.pad(touches, [(0, 0)] * (touches.ndim - 1) + [(0, 4)])
+        is_before = sum(later[..., k : k + touches.shape[-1]] for k in range(4)) > 0
+        speed = -jnp.diff(jnp.swapaxes(self.gap, -2, -1))[..., :-1] / self.dt[..., None, None]
+        return jnp.max(jnp.where(is_before, speed, 0.0), axis=(-2, -1), initial=0.0)
+
+    @property
     def final(self) -> State:
         """The state after the last step."""
         return State(self.displacement[-1], self.velocity[-1])

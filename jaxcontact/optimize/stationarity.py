@@ -9,11 +9,12 @@ from jax import Array
 
 from jaxcontact.control.bounds import BoundsLike
 from jaxcontact.control.inner_product import InnerProduct
-from jaxcontact.control.problem import ControlMap, Problem, as_partial
+from jaxcontact.control.problem import ControlMap, Problem
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.optimize.certificate import Stationarity, certify, motion_of
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.trees import as_partial
 
 
 @in_full_precision

@@ -27,6 +27,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from jaxcontact.scene.cells import boundary_facets, cell_volumes, components, facet_keys
+from jaxcontact.transforms.traced import as_array, is_traced
 
 __all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
 
@@ -44,6 +45,9 @@ class Mesh:
     """Node indices of the boundary facets of each set, (F,d) int32, oriented outward."""
     regions: dict[str, np.ndarray]
     """Cell indices of each region, (R,) int32."""
+    layout: np.ndarray | None = None
+    """Last concrete node positions, (N,d) [m]: where `points` are traced, the facets that meet are
+    found here. None if there were none."""
 
     @classmethod
     def from_arrays(
@@ -91,7 +95,7 @@ class Mesh:
             name: _as_indices(region, f"region {name!r}", (), len(corners))
             for name, region in regions.items()
         }
-        return cls(points=x, cells=corners, facets=facet_sets, regions=cell_sets)
+        return cls(x, corners, facet_sets, cell_sets, layout=_layout(x, None))
 
     def with_points(self, points: ArrayLike) -> Mesh:
         """The same topology at other node positions, for moving meshes and shape derivatives.
@@ -111,7 +115,48 @@ class Mesh:
         if x.shape != self.points.shape:
             raise ValueError(f"points have shape {x.shape}; pass {self.points.shape}, all nodes")
         _check_geometry(x, self.cells)
-        return dataclasses.replace(self, points=x)
+        return dataclasses.replace(self, points=x, layout=_layout(x, self.layout))
+
+    def moved(
+        self, rotation: ArrayLike | None = None, translation: ArrayLike | None = None
+    ) -> Mesh:
+        """The mesh in another place: rotation @ x + translation for every node x.
+
+        Args:
+            rotation: Rotation matrix about the origin, (d,d); None is none. May be traced.
+            translation: (d,) [m]; None is none. May be traced.
+
+        Returns:
+            The mesh with the same sets and regions.
+
+        Raises:
+            ValueError: A shape does not fit, or a concrete matrix is no rotation.
+
+        Derivative: by `points`, the rotation and the translation.
+        """
+        d, motion = self.dimension, (rotation, translation)
+        turn, shift = (np.eye(d) if rotation is None else as_array(rotation)), np.zeros(d)
+        if translation is not None:
+            shift = as_array(translation)
+        if turn.shape != (d, d) or shift.shape != (d,):
+            raise ValueError(
+                f"a mesh of dimension {d} needs a rotation ({d}, {d}) and a translation ({d},), "
+                f"got {turn.shape} and {shift.shape}"
+            )
+        if not is_traced(turn) and not _is_rotation(np.asarray(turn)):
+            raise ValueError(f"rotation must be orthogonal with determinant 1, got {turn.tolist()}")
+
+        def move(x: Any) -> Any:
+            # A product only where there is one: a translation leaves x @ 1 its digits.
+            turned = x if rotation is None else x @ turn.T
+            return turned + shift[None, :]
+
+        mesh = (
+            self
+            if self.layout is None or is_traced(motion)
+            else dataclasses.replace(self, layout=move(self.layout))
+        )
+        return mesh.with_points(move(self.points))
 
     @property
     def dimension(self) -> int:
@@ -135,6 +180,17 @@ class Mesh:
         not share the nodes at which they meet; merge these, or the parts move independently.
         """
         return components(self.cells, self.n_nodes)
+
+
+def _layout(points: Any, last: np.ndarray | None) -> np.ndarray | None:
+    """Concrete positions as NumPy; the last ones if these are traced."""
+    return last if isinstance(points, Tracer) else np.asarray(points)
+
+
+def _is_rotation(matrix: np.ndarray) -> bool:
+    """Whether a matrix (d,d) is a rotation, up to rounding in float32."""
+    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5)
+    return is_orthogonal and np.linalg.det(matrix) > 0.0
 
 
 def _match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:

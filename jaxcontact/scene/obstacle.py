@@ -41,6 +41,7 @@ class HalfSpace:
     normal: Array | np.ndarray
     """Normal of the plane, (d,), of any positive length; points from the obstacle to the body."""
 
+    @jax.jit
     def signed_distance(self, x: Array) -> Array:
         """Return the signed distance of one point (d,), a scalar [m]."""
         normal = jnp.asarray(self.normal, x.dtype)
@@ -59,6 +60,7 @@ class Ball:
     radius: float | Array
     """Radius, [m], positive."""
 
+    @jax.jit
     def signed_distance(self, x: Array) -> Array:
         """Return the signed distance of one point (d,), a scalar [m]."""
         return jnp.linalg.norm(x - jnp.asarray(self.center, x.dtype)) - self.radius
@@ -106,12 +108,20 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
     """
     check_obstacle(obstacle, points.shape[1])
     gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
+    if not is_traced(gradient):
+        _check_slope(obstacle, np.linalg.norm(np.asarray(gradient), axis=1))
+    normals, factor = _normals(gradient, getattr(obstacle, "radius", 1.0))
+    return gap * factor, normals
+
+
+# Without the gap, which may be traced where the normals are not.
+@jax.jit
+def _normals(gradient: Array, radius: Array) -> tuple[Array, Array]:
+    """Return the normals (C, d) of the gradients (C, d), and one, scalar; or all NaN."""
     slope = jnp.linalg.norm(gradient, axis=1, keepdims=True)
-    if not is_traced(slope):
-        _check_slope(obstacle, np.asarray(slope))
     is_distance = jnp.all(jnp.abs(slope - 1.0) <= SLOPE_TOLERANCE)
-    is_surface = jnp.asarray(getattr(obstacle, "radius", 1.0)) > 0.0
-    return poison_unless(is_distance & is_surface, (gap, -gradient / slope))
+    values = (-gradient / slope, jnp.ones((), gradient.dtype))
+    return poison_unless(is_distance & (radius > 0.0), values)
 
 
 def position_sizes(obstacle: Obstacle, points: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A scene: one body, its material, how it is held and loaded, and what it may touch."""
+"""A scene: bodies, their material, how they are held and loaded, and what they may touch."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxcontact.scene.facets import Facets, check_each_interface_once, check_facets
 from jaxcontact.scene.material import KelvinVoigt, check_material
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Obstacle, check_obstacle
@@ -20,13 +21,13 @@ from jaxcontact.transforms.traced import as_array, is_traced
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Scene:
-    """A viscoelastic body and the rigid obstacles it may meet, without friction.
+    """Viscoelastic bodies and the rigid obstacles or other bodies they may meet, without friction.
 
     `discretize` checks a scene and turns it into matrices.
     """
 
     mesh: Mesh
-    """The body in its stress-free reference configuration."""
+    """The bodies, connected parts of the mesh, in their stress-free reference configuration."""
 
     material: KelvinVoigt | Mapping[str, KelvinVoigt]
     """One material, or one for each region of the mesh (then every cell is in one region)."""
@@ -34,8 +35,9 @@ class Scene:
     clamped: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the facet sets that are held at zero displacement."""
 
-    contact: Mapping[str, Obstacle] = field(default_factory=dict)
-    """Facet sets that may touch, with the obstacle that each may touch."""
+    contact: Mapping[str, Obstacle | Facets] = field(default_factory=dict)
+    """Facet sets that may touch, with the obstacle that each may touch: a rigid one, or `Facets` of
+    another body."""
 
     traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
     """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
@@ -48,8 +50,9 @@ def check_scene(scene: Scene) -> None:
     """Check everything in a scene that is concrete.
 
     Raises:
-        ValueError: if a name is not in the mesh, clamped and contact sets share nodes, a vector
-            has the wrong shape or is not finite, or a material value is out of range.
+        ValueError: if a name is not in the mesh, clamped and contact sets share nodes, two bodies
+            share nodes or constrain each other's facets, a vector has the wrong shape or is not
+            finite, or a material value is out of range.
     """
     mesh = scene.mesh
     if isinstance(scene.clamped, str):
@@ -66,7 +69,11 @@ def check_scene(scene: Scene) -> None:
                 f"{shared.size} nodes, first {shared[:5].tolist()}; a clamped node cannot be in "
                 "contact: leave a row of facets between the two sets"
             )
-        check_obstacle(obstacle, mesh.dimension)
+        if isinstance(obstacle, Facets):
+            check_facets(name, obstacle, mesh)
+        else:
+            check_obstacle(obstacle, mesh.dimension)
+    check_each_interface_once(scene.contact, mesh)
     vectors = {f"traction[{name!r}]": vector for name, vector in scene.traction.items()}
     if scene.body_force is not None:
         vectors["body_force"] = scene.body_force
@@ -89,9 +96,15 @@ def cellwise_material(scene: Scene) -> KelvinVoigt:
     region_of_cell = np.zeros(scene.mesh.n_cells, np.int32)
     for number, region in enumerate(scene.material):
         region_of_cell[scene.mesh.regions[region]] = number
+    return _spread(tuple(scene.material.values()), region_of_cell)
+
+
+@jax.jit
+def _spread(materials: tuple[KelvinVoigt, ...], region_of_cell: Array) -> KelvinVoigt:
+    """Return the material of every cell, its fields (E,), from those of the regions."""
     return jax.tree.map(
         lambda *values: jnp.stack([jnp.asarray(value, float) for value in values])[region_of_cell],
-        *scene.material.values(),
+        *materials,
     )
 
 

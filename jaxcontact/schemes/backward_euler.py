@@ -63,7 +63,7 @@ class BackwardEuler:
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
-        """Return lam.(psi - N y)/tau and 1/2 |v' - v|_M^2 + 1/2 |y' - y|_A^2."""
+        """Return lam.N(y' - y)/tau and 1/2 |v' - v|_M^2 + 1/2 |y' - y|_A^2."""
         increment = new.displacement - old.displacement
         jump = new.velocity - old.velocity
         damping = jnp.dot(jump, operators.mass @ jump)

@@ -59,5 +59,5 @@ class ContactImplicit:
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
-        """Return the impact loss lam.(psi - N y)/tau."""
+        """Return the impact loss lam.N(y' - y)/tau."""
         return Losses(impact_loss(system, dt, old, new))

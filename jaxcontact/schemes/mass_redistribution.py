@@ -27,10 +27,8 @@ from types import ModuleType
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jax import Array
 from jax.core import Tracer
-from scipy.sparse.csgraph import connected_components
 
 from jaxcontact.system.block_matrix import (
     BlockMatrix,
@@ -39,6 +37,7 @@ from jaxcontact.system.block_matrix import (
     on_host,
     scatter,
 )
+from jaxcontact.system.bodies import body_numbers
 from jaxcontact.system.system import System
 
 #: How dear a tangential offset of a donor is, against a distant donor.
@@ -117,7 +116,7 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
 
 def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     """Return C, which gives every body of the mesh its own moments back."""
-    body = connected_bodies(system)[np.asarray(system.free_nodes)]
+    body = body_numbers(system)[np.asarray(system.free_nodes)]
     is_inside = ~np.isin(np.asarray(system.free_nodes), np.asarray(system.contact_nodes))
     lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
     corrections = [
@@ -127,15 +126,6 @@ def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     nodes = np.concatenate([correction.rows for correction in corrections])
     blocks = concatenate(*(correction.blocks for correction in corrections))
     return BlockMatrix(nodes, nodes, blocks)
-
-
-def connected_bodies(system: System) -> np.ndarray:
-    """Return the number of the connected part of the mesh to which each node belongs, (N,)."""
-    columns = np.asarray(system.nodal_mass.columns)
-    rows = np.broadcast_to(np.arange(system.n_nodes), columns.shape)
-    edges = (np.ones(columns.size, np.int8), (rows.ravel(), columns.ravel()))
-    graph = scipy.sparse.coo_array(edges, shape=(system.n_nodes, system.n_nodes))
-    return connected_components(graph, directed=False)[1]
 
 
 def _body_correction(
@@ -244,7 +234,7 @@ def _check_pairs(system: System) -> None:
     if system.size != d * len(system.free_nodes) or system.normals.unknowns.shape[1] != d:
         raise ValueError(
             "RedistributedMass needs the nodes of a mesh against rigid obstacles, not a reduced "
-            "model or two bodies; use jc.ContactStabilized()"
+            "model or contact between two bodies; use jc.ContactStabilized()"
         )
     shared = nodes.size - np.unique(nodes).size
     if shared:

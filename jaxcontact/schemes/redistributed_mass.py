@@ -95,7 +95,7 @@ class RedistributedMass:
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
-        """Return the impact loss lam.(psi - N y)/tau and the numerical loss."""
+        """Return the impact loss lam.N(y' - y)/tau and the numerical loss."""
         increment = new.displacement - old.displacement
         normal = increment - _remove_normal(system, increment)
         numerical = 0.5 * jnp.dot(normal, system.stiffness @ increment)

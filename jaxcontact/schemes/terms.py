@@ -8,14 +8,26 @@ from jax import Array
 
 from jaxcontact.contact import Bound
 from jaxcontact.schemes.interface import StepState
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 
 
 def trapezoidal_matrix(system: System, dt: Array) -> SymmetricMatrix:
     """Return D = M + tau/2 B + tau^2/4 A, (n, n)."""
-    matrix = system.mass + 0.25 * dt**2 * system.stiffness
-    return matrix if system.viscosity is None else matrix + 0.5 * dt * system.viscosity
+    values = _trapezoidal_values(system.mass, system.stiffness, system.viscosity, dt)
+    return SymmetricMatrix(values, system.stiffness.columns)
+
+
+# The values alone: the pattern must stay concrete where the caller is under jit.
+@jax.jit
+def _trapezoidal_values(
+    mass: ComponentwiseMatrix | SymmetricMatrix,
+    stiffness: SymmetricMatrix,
+    viscosity: SymmetricMatrix | None,
+    dt: Array,
+) -> Array:
+    matrix = mass + 0.25 * dt**2 * stiffness
+    return (matrix if viscosity is None else matrix + 0.5 * dt * viscosity).values
 
 
 def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:
@@ -60,6 +72,9 @@ def viscous_loss(system: System, dt: Array, increment: Array) -> Array:
 
 
 def impact_loss(system: System, dt: Array, old: StepState, new: StepState) -> Array:
-    """Return lam.(psi - N y)/tau [J]: what an impulse takes that acts at the new gap."""
-    gap = system.gap - system.normals @ old.displacement
-    return jnp.dot(new.impulse, gap) / dt
+    """Return lam.N(y' - y)/tau [J], the work of the impulse against the contact.
+
+    With exact contact the new gap of a pressed pair is zero, so that it is lam.(psi - N y)/tau.
+    """
+    increment = new.displacement - old.displacement
+    return jnp.dot(new.impulse, system.normals @ increment) / dt

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
-from jaxcontact.schemes.terms import trapezoidal_matrix, velocity_bound
+from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -68,5 +68,4 @@ class Trapezoidal:
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
         """Return the impact loss lam.Nw, of either sign."""
-        increment = new.displacement - old.displacement
-        return Losses(jnp.dot(new.impulse, system.normals @ increment) / dt)
+        return Losses(impact_loss(system, dt, old, new))

@@ -122,6 +122,7 @@ def stiffness_blocks(gradients: Array, volumes: Array, lame: tuple) -> Array:
     return first[:, None, None, None, None] * outer + second[:, None, None, None, None] * isotropic
 
 
+@jax.jit
 def nodal_areas(points: Array, facets: Array | np.ndarray) -> Array:
     """Return the integral of each hat function over a facet set, (N,) [m^(d-1)] (1D: one)."""
     corners = points[facets]
@@ -137,7 +138,7 @@ def nodal_areas(points: Array, facets: Array | np.ndarray) -> Array:
 
 
 class SceneValues(NamedTuple):
-    """Entries of the matrices in ELL layout, those of the masses scalar; nodal load (N, d)."""
+    """Entries of the matrices in ELL layout, those of the masses scalar; load (n,)."""
 
     mass: Array
     stiffness: Array
@@ -155,6 +156,7 @@ def scene_values(
     material: KelvinVoigt,
     pattern: NodePattern,
     all_nodes: NodePattern,
+    free_nodes: Array,
     body_force: Array | None,
     tractions: dict[str, tuple[Array, Array]],
     *,
@@ -168,6 +170,7 @@ def scene_values(
         material: scalars, or one value per cell (E,).
         pattern: sparsity on the free nodes.
         all_nodes: sparsity on all nodes.
+        free_nodes: the nodes whose displacement components are the unknowns, (n/d,).
         body_force: (d,) [N/m^d], or None.
         tractions: facets (F, d) and traction (d,) [N/m^(d-1)] of each loaded set.
         is_elastic: whether there is no viscosity.
@@ -194,7 +197,7 @@ def scene_values(
         viscosity=None if is_elastic else isotropic(material.viscous_lame()),
         l2_mass=assemble(pattern, l2_blocks),
         nodal_mass=assemble(all_nodes, l2_blocks),
-        load=load,
+        load=load[free_nodes].reshape(-1),
     )
     # Concrete values were checked before; traced ones cannot raise.
     return poison_unless(is_admissible(material) & jnp.all(volumes > 0.0), values)

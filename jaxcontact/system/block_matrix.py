@@ -88,14 +88,14 @@ def on_host(values: Array | np.ndarray) -> Array | np.ndarray:
     return values if isinstance(values, Tracer) else np.asarray(values)
 
 
-def concatenate(*parts: Array | np.ndarray) -> Array | np.ndarray:
+def concatenate(*parts: Array | np.ndarray, axis: int = 0) -> Array | np.ndarray:
     """Return the parts one after the other."""
     is_traced = any(isinstance(part, Tracer) for part in parts)
-    return jnp.concatenate(parts) if is_traced else np.concatenate(parts)
+    return jnp.concatenate(parts, axis) if is_traced else np.concatenate(parts, axis)
 
 
 def scatter(blocks: Array | np.ndarray, positions: np.ndarray, count: int) -> Array | np.ndarray:
-    """Return (count, d, d), the sums of the blocks that share a position."""
+    """Return (count, ...), the sums of the blocks (B, ...) that share a position."""
     if isinstance(blocks, Tracer):
         return jnp.zeros((count, *blocks.shape[1:]), blocks.dtype).at[positions].add(blocks)
     sums = np.zeros((count, *blocks.shape[1:]), blocks.dtype)

@@ -1,13 +1,14 @@
-"""The contact pairs of a scene: which node meets which obstacle, along which normal.
+"""The contact pairs of a scene: which node meets which obstacle or body, along which normal.
 
 A node that lies in two contact sets has a pair for each, as a corner between a floor and a wall
 needs them. Two equal rows in the contact operator however make the contact forces ambiguous and
 the contact problem singular, so what is one contact becomes one pair: sets with equal obstacles
-are one set, and of pairs at one node with equal normals only the nearest can ever touch.
+are one set, and of pairs at one node with equal rows only the nearest can ever touch.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,9 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.obstacle import Obstacle, gap_and_normals, position_sizes
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import nodal_areas
+from jaxcontact.system.block_matrix import concatenate
+from jaxcontact.system.mortar import mortar_rows
+from jaxcontact.system.pairing import direction_of, end_signs, find_meeting
 from jaxcontact.transforms.traced import is_traced
 
 #: Normals that differ by no more than this times the unit roundoff are equal.
@@ -30,57 +35,144 @@ class ContactPairs(NamedTuple):
     nodes: np.ndarray
     """Node of each pair, (C,) int32."""
 
-    gap: Array
+    masters: np.ndarray
+    """Nodes of the other body that a pair is coupled to, (C, m) int32; its own node for none."""
+
+    gap: Array | np.ndarray
     """Distance to the obstacle, (C,) [m]."""
 
-    normals: Array
+    normals: Array | np.ndarray
     """Unit normals towards the obstacle, (C, d)."""
 
-    area: Array
-    """Integral of the hat function of the node over its contact set, (C,) [m^(d-1)]."""
+    area: Array | np.ndarray
+    """Integral of the hat function of the node over its contact set, (C,) [m^(d-1)]; with another
+    body, over what lies before that."""
 
-    rounding: Array
-    """Rounding error of the gap that the positions of node and obstacle bring, (C,) [m]."""
+    rounding: Array | np.ndarray
+    """Rounding error of the gap, that of the positions of node and obstacle included, (C,) [m]."""
+
+    shares: Array | np.ndarray
+    """Share of each of them in what the pair is measured from, (C, m); zero for none."""
+
+    @property
+    def row_nodes(self) -> np.ndarray:
+        """Nodes of the rows of N, the node of the pair first, (C, 1+m) int32."""
+        return np.concatenate([self.nodes[:, None], self.masters], axis=1)
+
+    def row_weights(self) -> Array:
+        """Return the entries of the rows of N, nu and -m_k nu, (C, (1+m) d)."""
+        own = jnp.ones((len(self.nodes), 1), self.normals.dtype)
+        factors = jnp.concatenate([own, -jnp.asarray(self.shares, own.dtype)], axis=1)
+        entries = factors[:, :, None] * self.normals[:, None, :]  # (C, node, i)
+        return entries.reshape(len(entries), entries.shape[1] * entries.shape[2])
 
 
-def contact_pairs(scene: Scene, points: Array) -> ContactPairs:
-    """Return the contact pairs of the node positions (N, d)."""
+def contact_pairs(
+    scene: Scene, points: Array | np.ndarray, is_free: np.ndarray, dtype: np.dtype
+) -> ContactPairs:
+    """Return the contact pairs, in the digits of the node positions.
+
+    Args:
+        scene: the scene.
+        points: node positions, (N, d) [m].
+        is_free: nodes that are not clamped, (N,) bool.
+        dtype: the type to which the gap will be rounded.
+
+    Raises:
+        ValueError: if an obstacle defines no surface, or no node of a contact set sees the other
+            body, or where that is cannot be searched because all node positions are traced.
+    """
     sets = _merge_sets(scene)
     if not sets:
-        nothing = jnp.zeros(0, points.dtype)
-        return ContactPairs(np.zeros(0, np.int32), nothing, points[:0], nothing, nothing)
-    parts = []
-    for obstacle, facets in sets:
-        nodes = np.unique(facets).astype(np.int32)
-        gap, normals = gap_and_normals(obstacle, points[nodes])
-        places = jnp.abs(normals) @ position_sizes(obstacle, points[nodes])
-        rounding = jnp.finfo(points.dtype).eps * places
-        parts.append(
-            ContactPairs(nodes, gap, normals, nodal_areas(points, facets)[nodes], rounding)
-        )
-    nodes, *values = zip(*parts, strict=True)
-    pairs = ContactPairs(np.concatenate(nodes), *map(jnp.concatenate, values))
+        none, no_shares = np.zeros(0), np.zeros((0, 0))
+        nodes, masters = none.astype(np.int32), no_shares.astype(np.int32)
+        return ContactPairs(nodes, masters, none, points[:0], none, none, no_shares)
+    parts = [
+        _body_pairs(scene, names, obstacle, facets, points, is_free, dtype)
+        if isinstance(obstacle, Facets)
+        else _obstacle_pairs(obstacle, facets, points, dtype)
+        for names, obstacle, facets in sets
+    ]
+    width = max(part.masters.shape[1] for part in parts)
+    nodes, masters, *values = zip(*(_widened(part, width) for part in parts), strict=True)
+    pairs = ContactPairs(
+        np.concatenate(nodes), np.concatenate(masters), *(concatenate(*value) for value in values)
+    )
     if is_traced((pairs.gap, pairs.normals)):
         return pairs
     set_of_pair = np.repeat(np.arange(len(sets)), [len(part.nodes) for part in parts])
-    return _drop_twins(pairs, set_of_pair, [facets for _, facets in sets], points)
+    return _drop_twins(pairs, set_of_pair, [facets for *_, facets in sets], points)
 
 
-def _merge_sets(scene: Scene) -> list[tuple[Obstacle, np.ndarray]]:
-    """Return every different obstacle with the facets (F, d) that may touch it."""
-    sets: list[tuple[Obstacle, np.ndarray]] = []
+def _obstacle_pairs(
+    obstacle: Obstacle, facets: np.ndarray, points: Array | np.ndarray, dtype: np.dtype
+) -> ContactPairs:
+    """Return the pairs of facets (F, d) that may touch a rigid obstacle."""
+    nodes = np.unique(facets).astype(np.int32)
+    places = jnp.asarray(points[nodes])
+    gap, normals = gap_and_normals(obstacle, places)
+    area = _areas(points, facets, nodes)
+    rounding = _rounding(gap, normals, position_sizes(obstacle, places), dtype)
+    none = np.zeros((nodes.size, 0))
+    return ContactPairs(nodes, none.astype(np.int32), gap, normals, area, rounding, none)
+
+
+def _body_pairs(
+    scene: Scene,
+    names: list[str],
+    other: Facets,
+    facets: np.ndarray,
+    points: Array | np.ndarray,
+    is_free: np.ndarray,
+    dtype: np.dtype,
+) -> ContactPairs:
+    """Return the pairs of facets (F, d) of the named contact sets that may touch another body."""
+    meeting = find_meeting(names, facets, other, scene.mesh, is_free)
+    rows = mortar_rows(points, facets, end_signs(scene.mesh), direction_of(other), meeting)
+    places = jnp.asarray(points[meeting.nodes])
+    both = jnp.max(2.0 * jnp.abs(places) + jnp.abs(rows.gap)[:, None], axis=0)
+    rounding = _rounding(rows.gap, rows.normals, both, dtype)
+    nodes, masters = meeting.nodes, meeting.masters
+    return ContactPairs(nodes, masters, rows.gap, rows.normals, rows.area, rounding, rows.shares)
+
+
+def _widened(pairs: ContactPairs, width: int) -> ContactPairs:
+    """Return the pairs with `width` master nodes each, the added ones their own without share."""
+    more = width - pairs.masters.shape[1]
+    nodes = np.repeat(pairs.nodes[:, None], more, axis=1)
+    shares = concatenate(pairs.shares, np.zeros(nodes.shape), axis=1)
+    return pairs._replace(masters=np.concatenate([pairs.masters, nodes], axis=1), shares=shares)
+
+
+@jax.jit
+def _areas(points: Array, facets: Array, nodes: Array) -> Array:
+    """Return the integral of the hat function of each of the nodes, (C,) [m^(d-1)]."""
+    return nodal_areas(points, facets)[nodes]
+
+
+@partial(jax.jit, static_argnames="dtype")
+def _rounding(gap: Array, normals: Array, sizes: Array, dtype: np.dtype) -> Array:
+    """Return the rounding error (C,) [m] of gaps between positions of the sizes (d,)."""
+    of_places = jnp.finfo(sizes.dtype).eps * (jnp.abs(normals) @ sizes)
+    return jax.lax.stop_gradient(of_places + 4.0 * jnp.finfo(dtype).eps * jnp.abs(gap))
+
+
+def _merge_sets(scene: Scene) -> list[tuple[list[str], Obstacle | Facets, np.ndarray]]:
+    """Return every different obstacle, after the sets and before the facets that may touch it."""
+    sets: list[tuple[list[str], Obstacle | Facets, np.ndarray]] = []
     for name in sorted(scene.contact):
         obstacle, facets = scene.contact[name], scene.mesh.facets[name]
-        for k, (other, others) in enumerate(sets):
+        for k, (names, other, others) in enumerate(sets):
             if _are_equal(obstacle, other):
-                sets[k] = other, np.unique(np.concatenate([others, facets]), axis=0)
+                union = np.unique(np.concatenate([others, facets]), axis=0)
+                sets[k] = [*names, name], other, union
                 break
         else:
-            sets.append((obstacle, facets))
+            sets.append(([name], obstacle, facets))
     return sets
 
 
-def _are_equal(first: Obstacle, second: Obstacle) -> bool:
+def _are_equal(first: Obstacle | Facets, second: Obstacle | Facets) -> bool:
     """Return True if two obstacles are known to be equal; traced values are if they are one."""
     leaves, structure = jax.tree.flatten(first)
     others, other_structure = jax.tree.flatten(second)
@@ -91,9 +183,12 @@ def _are_equal(first: Obstacle, second: Obstacle) -> bool:
 
 
 def _drop_twins(
-    pairs: ContactPairs, set_of_pair: np.ndarray, facets: list[np.ndarray], points: Array
+    pairs: ContactPairs,
+    set_of_pair: np.ndarray,
+    facets: list[np.ndarray],
+    points: Array | np.ndarray,
 ) -> ContactPairs:
-    """Keep the nearest of the concrete pairs at one node that have one normal.
+    """Keep the nearest of the concrete pairs that have one row in N.
 
     Its area is that of the node in the union of their sets.
     """
@@ -101,12 +196,13 @@ def _drop_twins(
     tolerance = ROUNDING * np.finfo(normals.dtype).eps
     nodes, counts = np.unique(pairs.nodes, return_counts=True)
     shared = np.flatnonzero(np.isin(pairs.nodes, nodes[counts > 1]))
-    # The pairs at a node, those of one normal together, the nearest first.
+    rows = _dense_rows(pairs, shared) if shared.size else {}
+    # The pairs at a node, those of one row together, the nearest first.
     clusters: dict[int, list[list[int]]] = {}
     for pair in shared[np.argsort(gap[shared], kind="stable")]:
         at_node = clusters.setdefault(int(pairs.nodes[pair]), [])
         for cluster in at_node:
-            if np.linalg.norm(normals[cluster[0]] - normals[pair]) <= tolerance:
+            if np.linalg.norm(rows[cluster[0]] - rows[pair]) <= tolerance:
                 cluster.append(pair)
                 break
         else:
@@ -122,5 +218,15 @@ def _drop_twins(
                     union = np.unique(np.concatenate([facets[k] for k in joined]), axis=0)
                     areas[joined] = np.asarray(nodal_areas(points, union))
                 area[kept] = areas[joined][node]
-    values = (gap, normals, area, np.asarray(pairs.rounding))
-    return ContactPairs(pairs.nodes[keep], *(jnp.asarray(x[keep]) for x in values))
+    values = (gap, normals, area, np.asarray(pairs.rounding), np.asarray(pairs.shares))
+    return ContactPairs(pairs.nodes[keep], pairs.masters[keep], *(x[keep] for x in values))
+
+
+def _dense_rows(pairs: ContactPairs, chosen: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the rows of N of the chosen pairs, on the nodes that occur in them."""
+    of_row = pairs.row_nodes[chosen]
+    nodes, places = np.unique(of_row, return_inverse=True)
+    weights = np.asarray(pairs.row_weights())[chosen].reshape(*of_row.shape, -1)
+    rows = np.zeros((len(chosen), nodes.size, weights.shape[2]))
+    np.add.at(rows, (np.arange(len(chosen))[:, None], places.reshape(of_row.shape)), weights)
+    return dict(zip(chosen.tolist(), rows, strict=True))

@@ -10,6 +10,7 @@ transpose is the same gather.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -131,10 +132,7 @@ class ComponentwiseMatrix:
 
     def expand(self) -> SymmetricMatrix:
         """Return the matrix with all entries of its blocks, those between components zero."""
-        n_nodes, d = self.scalar.size, self.dimension
-        identity = jnp.eye(d, dtype=self.scalar.values.dtype)
-        blocks = self.scalar.values[:, None, :, None] * identity[None, :, None, :]
-        return SymmetricMatrix(blocks.reshape(-1, n_nodes * d), self.scalar.columns)
+        return SymmetricMatrix(_spread(self.scalar.values, self.dimension), self.scalar.columns)
 
     def diagonal(self) -> Array:
         """Return the diagonal, (n,)."""
@@ -145,19 +143,28 @@ class ComponentwiseMatrix:
         return self.expand().to_scipy()
 
 
+@partial(jax.jit, static_argnums=1)
+def _spread(values: Array, d: int) -> Array:
+    """Return the entries of d components that are not coupled, (width d, N d), of (width, N)."""
+    blocks = values[:, None, :, None] * jnp.eye(d, dtype=values.dtype)[None, :, None, :]
+    return blocks.reshape(-1, values.shape[1] * d)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ContactNormals:
     """The contact operator N of shape (C, n): row i maps y to the normal displacement of pair i.
 
-    Each row touches k unknowns (the d components of one contact node, k = d).
+    Each row touches k unknowns: the d components of one contact node, and of the nodes of another
+    body that it may meet.
     """
 
     weights: Array
-    """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i."""
+    """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i, for another
+    body followed by -m_ij nu_i (see `mortar.py`)."""
 
     unknowns: Array | np.ndarray
-    """Unknown of each entry, (C, k) int32."""
+    """Unknown of each entry, (C, k) int32; entries that are padded name their own with weight 0."""
 
     size: int | None = field(default=None, metadata={"static": True})
     """Number of all unknowns, n; None where it does not matter."""
@@ -167,6 +174,7 @@ class ContactNormals:
         """Number of contact pairs, C."""
         return self.unknowns.shape[0]
 
+    @jax.jit
     def __matmul__(self, y: Array) -> Array:
         """Return N y, (C,), for y (n,)."""
         return jnp.sum(self.weights * y[self.unknowns], axis=1)

@@ -56,7 +56,8 @@ class System:
     """Scalar L on all nodes, (N, N) [m^d]; the inner product of controls (N, d), clamped too."""
 
     normals: ContactNormals
-    """N, contact operator, (C, n); rows point from the body to the obstacle."""
+    """N, contact operator, (C, n); rows point from the body to the obstacle, or to the other body,
+    whose displacement they subtract."""
 
     gap: Array
     """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
@@ -71,8 +72,8 @@ class System:
     """Node of each contact pair, (C,) int32."""
 
     contact_area: Array
-    """Integral of the hat function over the contact set, (C,) [m^(d-1)]; impulse / (dt area)
-    is the contact pressure."""
+    """Integral of the hat function over the contact set, (C,) [m^(d-1)], between bodies over what
+    lies before the other one; impulse / (dt area) is the contact pressure."""
 
     points: Array
     """Node positions in the reference configuration, (N, d) [m]."""
@@ -132,6 +133,7 @@ class System:
         return _lift(self, x)
 
     @in_full_precision
+    @jax.jit
     def restrict(self, y: Array) -> Array:
         """Return the unknowns (..., n) of a nodal field (..., N, d).
 
@@ -188,6 +190,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         cellwise_material(scene),
         pattern,
         all_nodes,
+        free_nodes,
         None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
         {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
         is_elastic=is_elastic(scene),
@@ -195,10 +198,11 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
         # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, jnp.asarray(mesh.points))
-    rounding = pairs.rounding + 4.0 * jnp.finfo(dtype).eps * jnp.abs(pairs.gap)
+        pairs = contact_pairs(scene, as_array(mesh.points), is_free, dtype)
+        weights = jnp.asarray(pairs.row_weights(), dtype)
     components = np.arange(dimension, dtype=np.int32)
-    unknowns = numbers[pairs.nodes].astype(np.int32)[:, None] * dimension + components[None, :]
+    rows = numbers[pairs.row_nodes].astype(np.int32)[:, :, None]
+    unknowns = (rows * dimension + components[None, None, :]).reshape(weights.shape)
 
     def on_free(values: Array) -> SymmetricMatrix:
         return SymmetricMatrix(values, pattern.columns)
@@ -209,12 +213,12 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(pairs.normals.astype(dtype), unknowns, dimension * free_nodes.size),
-        gap=pairs.gap.astype(dtype),
-        gap_rounding=jax.lax.stop_gradient(rounding).astype(dtype),
-        load=values.load[free_nodes].reshape(-1),
+        normals=ContactNormals(weights, unknowns, dimension * free_nodes.size),
+        gap=jnp.asarray(pairs.gap, dtype),
+        gap_rounding=jnp.asarray(pairs.rounding, dtype),
+        load=values.load,
         contact_nodes=pairs.nodes,
-        contact_area=pairs.area.astype(dtype),
+        contact_area=jnp.asarray(pairs.area, dtype),
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
@@ -239,6 +243,7 @@ def _free_components(system: System, y: Array) -> Array:
 
 
 @in_full_precision
+@jax.jit
 def _lift(system: System, x: Array) -> Array:
     if system.basis is not None:
         x = x @ system.basis.vectors.T

@@ -1,5 +1,6 @@
 """The derivative of one contact problem, against dense saddle-point systems."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcontact as jc
-from jaxcontact.contact import Bound, ContactProblem, Guess, Status, contact_form
+from jaxcontact.contact import Bound, Guess, Status, contact_problem
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 N_UNKNOWNS, N_PAIRS = 8, 4
@@ -45,8 +46,8 @@ def solve(matrix, weights, rhs, bound, solver=SOLVERS[0], weak_contact=None):
     symmetric = SymmetricMatrix((matrix + matrix.T) / 2, jnp.asarray(COLUMNS))
     normals = ContactNormals(weights, jnp.asarray(UNKNOWNS))
     factor = jc.Dense().factorize(*jax.lax.stop_gradient((symmetric, normals)))
-    form = contact_form(factor, solver)
-    problem = ContactProblem(symmetric, normals, form, weak_contact=weak_contact)
+    problem = contact_problem(symmetric, normals, factor, solver)
+    problem = replace(problem, weak_contact=weak_contact)
     nothing = jnp.zeros(N_PAIRS)
     w, solution = problem.solve(rhs, Bound(bound, nothing), Guess(nothing > 0))
     return w, solution.multiplier, solution.active, solution.status
@@ -219,8 +220,8 @@ def test_step_gradient_in_weak_contact_counts_it_as_strong():
     touching = jnp.asarray(normals @ np.linalg.solve(matrix, rhs))
     symmetric = SymmetricMatrix(matrix, jnp.asarray(COLUMNS))
     operator = ContactNormals(weights, jnp.asarray(UNKNOWNS))
-    form = contact_form(jc.Dense().factorize(symmetric, operator), SOLVERS[0])
-    problem = ContactProblem(symmetric, operator, form)
+    factor = jc.Dense().factorize(symmetric, operator)
+    problem = contact_problem(symmetric, operator, factor, SOLVERS[0])
 
     def normal_velocity(r):
         resolution = jnp.full(N_PAIRS, 1e-13)
@@ -259,7 +260,7 @@ def test_step_without_contact_pairs_is_a_linear_solve_with_its_gradients():
         symmetric = SymmetricMatrix((matrix + matrix.T) / 2, jnp.asarray(COLUMNS))
         nothing = ContactNormals(jnp.zeros((0, 2)), jnp.zeros((0, 2), jnp.int32))
         factor = jc.Dense().factorize(jax.lax.stop_gradient(symmetric), nothing)
-        problem = ContactProblem(symmetric, nothing, contact_form(factor, SOLVERS[0]))
+        problem = contact_problem(symmetric, nothing, factor, SOLVERS[0])
         guess = Guess(jnp.zeros(0, bool))
         w, solution = problem.solve(rhs, Bound(jnp.zeros(0), jnp.zeros(0)), guess)
         return jnp.sum(jnp.sin(w)), (w, solution.status)

@@ -1,6 +1,7 @@
 """Claims about conjugate gradients: the same motion and derivatives as the dense solver."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import jax
@@ -18,7 +19,8 @@ STEPS = 30
 DT = 0.15
 
 
-def make_system(dtype=jnp.float64):
+@cache
+def block(dtype=jnp.float64):
     mesh = jc.meshes.rectangle((1.0, 1.0), h=1 / 5)
     plane = jc.HalfSpace(np.array([0.0, -0.01]), np.array([0.1, 1.0]))
     material = jc.KelvinVoigt(young=1.0, poisson=0.3, shear_viscosity=0.01)
@@ -26,9 +28,12 @@ def make_system(dtype=jnp.float64):
     return jc.discretize(scene, dtype=dtype)
 
 
-SYSTEM = make_system()
 SOLVERS: dict[str, Any] = {"dense": jc.Dense(), "cg": jc.ConjugateGradient()}
-STEPPERS = {name: jc.prepare(SYSTEM, DT, linear_solver=solver) for name, solver in SOLVERS.items()}
+
+
+@cache
+def steppers():
+    return {name: jc.prepare(block(), DT, linear_solver=x) for name, x in SOLVERS.items()}
 
 
 def iterate(**options) -> Any:
@@ -40,7 +45,8 @@ def throw(system):
     return jc.State(rest, rest.at[:, 1].set(-0.1))
 
 
-def control(system=SYSTEM):
+def control(dtype=jnp.float64):
+    system = block(dtype)
     shape = (STEPS, system.n_nodes, system.dimension)
     return 0.05 * jnp.sin(jnp.arange(np.prod(shape), dtype=system.dtype)).reshape(shape)
 
@@ -56,7 +62,7 @@ def assert_close(actual, expected, tolerance=AGREEMENT):
 
 
 def test_conjugate_gradient_gives_the_motion_of_dense():
-    dense, cg = (jc.simulate(s, control(), initial=throw(SYSTEM)) for s in STEPPERS.values())
+    dense, cg = (jc.simulate(s, control(), initial=throw(block())) for s in steppers().values())
     assert 0.2 < np.mean(np.any(np.asarray(dense.active), axis=1))
     for name in ("displacement", "velocity", "gap", "contact_impulse"):
         assert_close(getattr(cg, name), getattr(dense, name))
@@ -65,7 +71,7 @@ def test_conjugate_gradient_gives_the_motion_of_dense():
 
 
 def test_conjugate_gradient_gives_the_gradient_of_dense():
-    dense, cg = (jax.grad(objective, argnums=1)(s, control()) for s in STEPPERS.values())
+    dense, cg = (jax.grad(objective, argnums=1)(s, control()) for s in steppers().values())
     assert_close(cg, dense)
 
 
@@ -76,7 +82,7 @@ def test_conjugate_gradient_gives_the_hessian_product_of_dense():
         gradient = jax.grad(lambda u: objective(stepper, u))
         return jax.jvp(gradient, (control(),), (direction,))[1]
 
-    dense, cg = (product(s) for s in STEPPERS.values())
+    dense, cg = (product(s) for s in steppers().values())
     assert_close(cg, dense)
 
 
@@ -99,11 +105,11 @@ def test_conjugate_gradient_gives_the_material_gradient_of_dense():
 
 
 def test_conjugate_gradient_holds_a_fixed_active_set():
-    factor = STEPPERS["cg"].operators.problem.form.factor
-    D, N = factor.matrix.to_scipy(), SYSTEM.normals.to_scipy(SYSTEM.size)
-    active = np.arange(SYSTEM.normals.count) % 2 == 0
-    rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
-    bound = jnp.cos(jnp.arange(SYSTEM.normals.count, dtype=float))
+    factor = steppers()["cg"].operators.problem.form.factor
+    D, N = factor.matrix.to_scipy(), block().normals.to_scipy(block().size)
+    active = np.arange(block().normals.count) % 2 == 0
+    rhs = jnp.sin(jnp.arange(block().size, dtype=float))
+    bound = jnp.cos(jnp.arange(block().normals.count, dtype=float))
     w, p = factor.solve_constrained(jnp.asarray(active), rhs, bound)
     assert_close((N @ np.asarray(w))[active], bound[active])
     assert_close(D @ np.asarray(w) + N.T @ np.asarray(p), rhs)
@@ -231,8 +237,8 @@ def test_conjugate_gradient_keeps_a_heavy_body_at_rest_as_dense():
     scene = jc.Scene(mesh, material, contact={"bottom": plane}, body_force=np.array([0.0, -9.81]))
     system = jc.discretize(scene)
     # Free on the ground and steps much longer than a period: condition about 3e5.
-    steppers = [jc.prepare(system, 0.1, linear_solver=solver) for solver in SOLVERS.values()]
-    settled = jc.simulate(steppers[0], steps=1000)
+    both = [jc.prepare(system, 0.1, linear_solver=solver) for solver in SOLVERS.values()]
+    settled = jc.simulate(both[0], steps=1000)
     above = settled.displacement[-1].at[:, 1].add(1e-12)  # rounding may lie below the plane
     initial = jc.State(above, jnp.zeros_like(above))
 
@@ -245,7 +251,7 @@ def test_conjugate_gradient_keeps_a_heavy_body_at_rest_as_dense():
         return jax.value_and_grad(impulse, has_aux=True)(u)
 
     nothing = jnp.zeros((10, system.n_nodes, 2))
-    ((_, dense), dense_slope), ((_, cg), cg_slope) = (run(s, nothing) for s in steppers)
+    ((_, dense), dense_slope), ((_, cg), cg_slope) = (run(s, nothing) for s in both)
     np.testing.assert_array_equal(cg.status, jc.Status.CONVERGED)
     assert_close(cg.displacement, dense.displacement)
     assert_close(cg.contact_impulse, dense.contact_impulse)
@@ -253,9 +259,9 @@ def test_conjugate_gradient_keeps_a_heavy_body_at_rest_as_dense():
 
 
 def residual_of_a_solve(tolerance):
-    stepper = jc.prepare(SYSTEM, DT, linear_solver=iterate(tolerance=tolerance))
+    stepper = jc.prepare(block(), DT, linear_solver=iterate(tolerance=tolerance))
     factor = stepper.operators.problem.form.factor
-    rhs = jnp.sin(jnp.arange(SYSTEM.size, dtype=float))
+    rhs = jnp.sin(jnp.arange(block().size, dtype=float))
     residual = rhs - factor.matrix @ factor.solve(rhs)
     weights = factor.preconditioner
     return float(jnp.sqrt(jnp.sum(weights * residual**2) / jnp.sum(weights * rhs**2)))
@@ -278,10 +284,10 @@ def test_conjugate_gradient_refuses_contact_sets_that_share_a_node():
 
 
 def exhausted():
-    stepper = STEPPERS["cg"]
+    stepper = steppers()["cg"]
     short = iterate(max_iterations=3)
     # prepare would refuse this solver at once, so the failure is put where values decide it.
-    factor = short.factorize(stepper.operators.problem.matrix, SYSTEM.normals)
+    factor = short.factorize(stepper.operators.problem.matrix, block().normals)
     form = replace(stepper.operators.problem.form, factor=factor)
     operators = stepper.operators.changed(lambda _, problem: replace(problem, form=form))
     return replace(stepper, operators=operators)
@@ -289,7 +295,7 @@ def exhausted():
 
 def test_conjugate_gradient_out_of_iterations_is_an_error():
     with pytest.raises(jc.SolveError, match="non finite"):
-        jc.simulate(exhausted(), control(), initial=throw(SYSTEM))
+        jc.simulate(exhausted(), control(), initial=throw(block()))
 
 
 def test_conjugate_gradient_out_of_iterations_is_non_finite_under_jit():
@@ -301,14 +307,14 @@ def test_conjugate_gradient_out_of_iterations_is_non_finite_under_jit():
 
 def test_conjugate_gradient_out_of_iterations_is_refused_by_prepare():
     with pytest.raises(ValueError, match="positive definite"):
-        jc.prepare(SYSTEM, DT, linear_solver=iterate(max_iterations=3))
+        jc.prepare(block(), DT, linear_solver=iterate(max_iterations=3))
 
 
 def test_conjugate_gradient_works_in_float32():
-    system = make_system(jnp.float32)
+    system = block(jnp.float32)
     stepper = jc.prepare(system, DT, linear_solver=iterate())
-    single = jc.simulate(stepper, control(system), initial=throw(system))
-    double = jc.simulate(STEPPERS["dense"], control(), initial=throw(SYSTEM))
+    single = jc.simulate(stepper, control(jnp.float32), initial=throw(system))
+    double = jc.simulate(steppers()["dense"], control(), initial=throw(block()))
     assert single.displacement.dtype == jnp.float32
     np.testing.assert_array_equal(single.status, jc.Status.CONVERGED)
     assert_close(single.displacement, double.displacement, SINGLE_AGREEMENT)
@@ -351,7 +357,7 @@ def test_constraint_holds_to_rounding_after_many_iterations():
 def test_small_numbers_are_solved_for_in_float32():
     # The squares of these norms are below the smallest number of float32.
     factor = jc.prepare(
-        make_system(jnp.float32), DT, linear_solver=jc.ConjugateGradient()
+        block(jnp.float32), DT, linear_solver=jc.ConjugateGradient()
     ).operators.problem.form.factor
     rhs = jnp.sin(jnp.arange(factor.matrix.size, dtype=jnp.float32))
     unit = jnp.float32(2.0**-80)

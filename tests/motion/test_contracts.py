@@ -1,27 +1,31 @@
 """Options that do not fit end in a sentence that says what to write instead."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.bodies import BLOCK, DT, VISCOUS, block, block_scene
+from support.bodies import BLOCK, DT, VISCOUS, block, block_scene, discretized
 
 import jaxcontact as jc
 from jaxcontact.schemes import Losses, SchemeMatrices, StepResult
 from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 
-SYSTEM = jc.discretize(block_scene(VISCOUS))
-CLAMPED = jc.discretize(
-    jc.Scene(
-        BLOCK,
-        VISCOUS,
-        clamped=("top",),
-        contact={"bottom": jc.HalfSpace(np.array([0.0, -0.001]), np.array([0.0, 1.0]))},
-        body_force=np.array([0.0, -10.0]),
+
+@cache
+def system():
+    return discretized(block_scene(VISCOUS))
+
+
+@cache
+def clamped():
+    plane = jc.HalfSpace(np.array([0.0, -0.001]), np.array([0.0, 1.0]))
+    load = np.array([0.0, -10.0])
+    return discretized(
+        jc.Scene(BLOCK, VISCOUS, clamped=("top",), contact={"bottom": plane}, body_force=load)
     )
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +50,9 @@ class Newmark:
 
 
 def test_a_scheme_written_after_the_protocol_runs_and_keeps_its_ledger():
-    stepper = jc.prepare(SYSTEM, DT, scheme=Newmark())
+    stepper = jc.prepare(system(), DT, scheme=Newmark())
     trajectory = jc.simulate(stepper, steps=12)
-    expected = jc.simulate(jc.prepare(SYSTEM, DT), steps=12)
+    expected = jc.simulate(jc.prepare(system(), DT), steps=12)
     np.testing.assert_array_equal(trajectory.displacement, expected.displacement)
     assert np.any(trajectory.active)
     assert np.max(np.abs(jc.energy(stepper, trajectory).residual)) < 1e-12
@@ -58,10 +62,10 @@ def test_a_scheme_written_after_the_protocol_runs_and_keeps_its_ledger():
 def test_conjugate_gradients_refuse_a_contact_solver_that_needs_the_compliance(solver):
     options = {"linear_solver": jc.ConjugateGradient(), "contact_solver": solver}
     with pytest.raises(ValueError, match=r"jc\.SemismoothNewton\(\).*jc\.NestedDissection\(\)"):
-        jc.prepare(SYSTEM, DT, **options)
+        jc.prepare(system(), DT, **options)
     with pytest.raises(ValueError, match=r"jc\.SemismoothNewton\(\)"):
-        jc.solve_static(CLAMPED, **options)
-    stepper = jc.prepare(SYSTEM, DT, linear_solver=jc.ConjugateGradient())
+        jc.solve_static(clamped(), **options)
+    stepper = jc.prepare(system(), DT, linear_solver=jc.ConjugateGradient())
     with pytest.raises(ValueError, match=r"jc\.NestedDissection\(\)"):
         jc.with_contact(stepper, solver)
 
@@ -80,13 +84,13 @@ def test_conjugate_gradients_refuse_a_contact_solver_that_needs_the_compliance(s
 )
 def test_prepare_says_what_an_option_must_be(options, advice):
     with pytest.raises(ValueError, match=advice):
-        jc.prepare(SYSTEM, DT, **options)
+        jc.prepare(system(), DT, **options)
 
 
 @pytest.mark.parametrize("dt", [True, 0.0, -1.0, np.nan, np.inf, np.ones(2)])
 def test_prepare_refuses_a_step_length_that_is_none(dt):
     with pytest.raises(ValueError, match="dt must be a positive number of seconds"):
-        jc.prepare(SYSTEM, dt)
+        jc.prepare(system(), dt)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +118,7 @@ def test_simulate_says_what_an_option_must_be(options, advice):
 )
 def test_solve_static_says_what_an_option_must_be(options, advice):
     with pytest.raises(ValueError, match=advice):
-        jc.solve_static(CLAMPED, **options)
+        jc.solve_static(clamped(), **options)
 
 
 def test_trajectory_knows_its_step_and_its_forces():
@@ -133,12 +137,12 @@ def test_cost_refuses_another_step_than_that_of_the_motion():
     stepper = block()
     trajectory = jc.simulate(stepper, steps=4)
     target = jnp.zeros_like(trajectory.displacement)
-    cost = jc.TrackingCost(SYSTEM, dt=2 * DT, target=target)
+    cost = jc.TrackingCost(system(), dt=2 * DT, target=target)
     with pytest.raises(ValueError, match=r"dt=0.04.*0.02"):
         cost(trajectory)
     # Under jit nothing can raise, but no number comes out either.
     assert np.isnan(jax.jit(lambda stepper: cost(jc.simulate(stepper, steps=4)))(stepper))
-    right, silent = (jc.TrackingCost(SYSTEM, target=target, **o) for o in ({"dt": DT}, {}))
+    right, silent = (jc.TrackingCost(system(), target=target, **o) for o in ({"dt": DT}, {}))
     assert right(trajectory) == silent(trajectory) > 0.0
     with pytest.raises(ValueError, match=r"dt=0.04.*0.02"):
         jc.contact_force(trajectory, dt=2 * DT)

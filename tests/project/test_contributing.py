@@ -41,6 +41,10 @@ def test_contributed_linear_solver_gives_the_same_motion_by_either_factor(exampl
     np.testing.assert_allclose(example["by_dissection"], example["position"], rtol=1e-10)
 
 
+def test_contributed_contact_solver_gives_the_same_motion(example):
+    np.testing.assert_allclose(example["by_gradient_steps"], example["position"], rtol=1e-9)
+
+
 @pytest.mark.parametrize(("limit", "expected"), [(500, DenseFactor), (10, DissectionFactor)])
 def test_contributed_linear_solver_hands_over_by_the_number_of_unknowns(example, limit, expected):
     body = jc.meshes.rectangle((1.0, 1.0), h=0.5)

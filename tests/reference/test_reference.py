@@ -426,6 +426,10 @@ position, velocity = jax.jit(BouncingMass.position), jax.jit(BouncingMass.veloci
 impact_time = jax.jit(BouncingMass.impact_time)
 
 
+#: Two programs may round the time of an impact differently, by a few units of the last place.
+INSTANT = 1e-15
+
+
 def bounce(mass, time):
     """Position and velocity at a time by following the impacts one by one, and their times."""
     height, velocity, now, impacts = mass.height, mass.initial_velocity, 0.0, []
@@ -464,16 +468,16 @@ def test_bouncing_mass_impact_times_are_those_of_the_loop(mass):
     impacts = np.array(impacts[:20])
     times = impact_time(mass, np.arange(len(impacts)))
     np.testing.assert_allclose(times, impacts, rtol=1e-13)
-    # At an impact the velocity is the one after it.
+    after = times * (1 + INSTANT)
     np.testing.assert_allclose(
-        velocity(mass, times), mass.impact_speed(np.arange(len(impacts)) + 1), atol=1e-11
+        velocity(mass, after), mass.impact_speed(np.arange(len(impacts)) + 1), atol=1e-11
     )
 
 
 @pytest.mark.parametrize("name", ["elastic", "nearly elastic", "inelastic"])
 def test_bouncing_mass_velocity_just_before_an_impact_is_the_incoming_one(name):
     k = np.arange(20)
-    before = np.nextafter(impact_time(MASSES[name], k), 0)
+    before = impact_time(MASSES[name], k) * (1 - INSTANT)
     expected = -MASSES[name].impact_speed(k)
     np.testing.assert_allclose(velocity(MASSES[name], before), expected, atol=1e-11)
 

@@ -48,7 +48,7 @@ def test_mesh_survives_a_round_trip_through_the_pytree():
     mesh = square(facets={"bottom": [[0, 1]]}, regions={"lower": [0]})
     leaves, treedef = jax.tree_util.tree_flatten(mesh)
     again = jax.tree_util.tree_unflatten(treedef, leaves)
-    assert len(leaves) == 4
+    assert len(leaves) == 5
     assert again.facets["bottom"] is mesh.facets["bottom"]
     assert isinstance(again.cells, np.ndarray)
 

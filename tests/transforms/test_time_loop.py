@@ -10,6 +10,15 @@ import jaxcontact as jc
 STEPS = 60
 
 
+#: Two loops of the same operations may round them differently; impacts amplify that a little.
+ROUNDING = 1e-12
+
+
+def assert_same(actual, expected):
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=ROUNDING * size)
+
+
 @pytest.fixture(scope="module")
 def problem():
     return jc.scenes.half_disc_control(h=15 / 4, gap=0.1, steps=STEPS)
@@ -24,8 +33,9 @@ def test_simulate_records_the_same_states(problem, save_every, checkpoint):
     assert np.any(np.asarray(every.active))
     for name in ("time", "displacement", "velocity", "gap"):
         expected = getattr(every, name)[::save_every]
-        np.testing.assert_allclose(getattr(some, name), expected, rtol=1e-14, atol=1e-14)
-    for name in ("contact_impulse", "active", "status"):
+        assert_same(getattr(some, name), expected)
+    assert_same(some.contact_impulse, every.contact_impulse)
+    for name in ("active", "status"):
         np.testing.assert_array_equal(getattr(some, name), getattr(every, name))
 
 
