@@ -7,7 +7,7 @@ u = sqrt(c / d) dx its linearisation is symmetric with unit diagonal,
 
     (K W K + diag(1 - c)) u = -K F,    K = diag sqrt(c / d),    F = W p + q - g,
 
-and dx = d K u - F - W K u needs no division by a share that may vanish.
+solved by conjugate gradients; dx = d K u - F - W K u needs no division by a share that may vanish.
 Source: Chen, Mangasarian, Comput. Optim. Appl. 5 (1996) 97-138 for smoothing by x.
 """
 
@@ -22,7 +22,13 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.contact import complementarity
-from jaxcontact.contact.complementarity import Guess, Solution, Status, separation
+from jaxcontact.contact.complementarity import (
+    Guess,
+    Solution,
+    Status,
+    separation,
+    solve_unit_diagonal,
+)
 from jaxcontact.transforms.traced import is_traced
 
 #: Halvings of a Newton step before it is taken anyway.
@@ -129,7 +135,16 @@ def solve(
         def product(u: Array) -> Array:
             return root * (compliance @ (root * u)) + pair.open * u
 
-        scaled = root * _conjugate_gradients(product, -root * error)
+        def factorized() -> Array:
+            matrix = root[:, None] * compliance * root[None, :] + jnp.diag(pair.open)
+            return solve_unit_diagonal(matrix, rhs)
+
+        rhs = -root * error
+        found = _conjugate_gradients(product, rhs)
+        # Pairs that lean on each other make the matrix nearly singular.
+        missed = jnp.linalg.norm(product(found) - rhs)
+        is_solved = missed <= jnp.finfo(rhs.dtype).eps ** 0.75 * jnp.linalg.norm(rhs)
+        scaled = root * jax.lax.cond(is_solved, lambda: found, factorized)
         return diagonal * scaled - error - compliance @ scaled
 
     def advance(descent: _Descent) -> _Descent:
