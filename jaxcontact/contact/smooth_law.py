@@ -205,7 +205,7 @@ def _conjugate_gradients(product: Callable[[Array], Array], rhs: Array) -> Array
     """Return x, (C,), with an SPD product x = rhs.
 
     Rows of open pairs are those of the identity, so that there are about as many steps as closed
-    pairs; a Cholesky factor of all pairs costs more from about 30 on.
+    pairs; a Cholesky factor of all pairs costs more where most of many pairs are open.
     """
     least = jnp.finfo(rhs.dtype).eps ** 2 * jnp.vdot(rhs, rhs)
 

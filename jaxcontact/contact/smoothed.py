@@ -26,8 +26,8 @@ from jaxcontact.contact.complementarity import Guess, Solution
 from jaxcontact.contact.smooth_law import PairState
 from jaxcontact.transforms.traced import poison_unless
 
-#: s in units of the closing speed. Half of it lets 3 % to 15 % of the dependence on the phase
-#: through; ten times as much is a soft body.
+#: s in units of the closing speed. By z / sinh z half of it would let 15 % of the dependence on the
+#: phase through; more of it smooths the motion more.
 RANGE = 0.4
 
 #: Below this Courant number of the contact nodes `for_scene` takes a range of the whole speed: the
@@ -41,12 +41,13 @@ class SmoothedContact:
     """Smooth contact whose gradient through impacts converges with the mesh.
 
     A pair feels the obstacle within some s dt, s = 0.4 `speed`, in front of it and never touches;
-    in rest it stays 0.7 s dt away. Farther off there is no force, and no gradient before touch: for
-    starts that do not touch use `RelaxedContact`. Take exact contact for the motion, its forces and
-    its certificates, and this law for derivatives through impacts, with `ContactImplicit`: one run
-    gives the gradient that a mean over all phases of the touch would have. The speed may be wrong
-    by 1.3 downwards and by 4 upwards; through several impacts, whose ripples multiply, take 1.5
-    times of it. It is a leaf: a new value compiles nothing.
+    in rest it stays where its load is carried, -s dt ln(1 - exp(-d p / s)) away. Farther off there
+    is no force, and no gradient before touch: for starts that do not touch use `RelaxedContact`.
+    Take exact contact for the motion, its forces and its certificates, and this law for derivatives
+    through impacts, with `ContactImplicit`: one run gives the gradient that a mean over all phases
+    of the touch would have. Rather give a speed that is too large than one that is too small;
+    through several impacts, whose ripples multiply, take 1.5 times of it. It is a leaf: a new value
+    compiles nothing.
 
     `prepare` and `with_contact` refuse a concrete speed that is not positive and finite; a traced
     one ends the step as not finite.
