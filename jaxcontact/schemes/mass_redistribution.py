@@ -231,10 +231,15 @@ def _check_semidefinite(system: System, mass: BlockMatrix) -> None:
 def _check_pairs(system: System) -> None:
     """Check that every contact pair is one node against a rigid obstacle."""
     d, nodes = system.dimension, np.asarray(system.contact_nodes)
-    if system.size != d * len(system.free_nodes) or system.normals.unknowns.shape[1] != d:
+    if system.basis is not None:
         raise ValueError(
-            "RedistributedMass needs the nodes of a mesh against rigid obstacles, not a reduced "
-            "model or contact between two bodies; use jc.ContactStabilized()"
+            "RedistributedMass moves mass from contact nodes to their neighbours, and the unknowns "
+            "of a reduced model belong to no node; use jc.ContactStabilized()"
+        )
+    if system.normals.weights.shape[1] != d:
+        raise ValueError(
+            "RedistributedMass needs the nodes of a mesh against rigid obstacles, not contact "
+            "between two bodies; use jc.ContactStabilized()"
         )
     shared = nodes.size - np.unique(nodes).size
     if shared:
