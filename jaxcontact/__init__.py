@@ -42,6 +42,7 @@ from jaxcontact.motion.pressure import contact_pressure
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
 from jaxcontact.motion.stepper import Stepper, prepare, with_contact
+from jaxcontact.motion.stress import Stress, stress
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.optimize import (
     LBFGS,
@@ -133,6 +134,7 @@ __all__ = [
     "Status",
     "SteepestDescent",
     "Stepper",
+    "Stress",
     "Strong",
     "System",
     "TrackingCost",
@@ -170,6 +172,7 @@ __all__ = [
     "simulate",
     "solve_static",
     "stationarity",
+    "stress",
     "with_contact",
 ]
 
