@@ -3,8 +3,7 @@
 Own code because meshio reads no side sets and no names of blocks, and does not know the element
 types that most programs write (TETRA4, TET4, TRI3).
 
-Source: Sjaardema and others, EXODUS II: A Finite Element Data Model, SAND92-2137; its table of the
-sides of elements.
+Source: Schoof, Yarberry, EXODUS II: A Finite Element Data Model, SAND92-2137 (1994), 4.8 (sides).
 """
 
 from __future__ import annotations
