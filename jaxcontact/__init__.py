@@ -71,6 +71,7 @@ from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.scene.quality import MeshQuality
 from jaxcontact.scene.scene import Scene
 from jaxcontact.schemes import (
     BackwardEuler,
@@ -113,6 +114,7 @@ __all__ = [
     "KelvinVoigt",
     "MemoryEstimate",
     "Mesh",
+    "MeshQuality",
     "NestedDissection",
     "NewtonCG",
     "OpenBranch",
