@@ -10,6 +10,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaxcontact import reference
+from jaxcontact.accuracy.estimate import ErrorEstimate, estimate_error
+from jaxcontact.accuracy.reduction_error import ReductionError, reduction_error
 from jaxcontact.contact import (
     AlongDirection,
     ClosedBranch,
@@ -105,6 +107,7 @@ __all__ = [
     "Descent",
     "Ending",
     "Energy",
+    "ErrorEstimate",
     "Facets",
     "GradientCheck",
     "HalfSpace",
@@ -122,6 +125,7 @@ __all__ = [
     "PhaseMean",
     "ProjectedGaussSeidel",
     "RedistributedMass",
+    "ReductionError",
     "RelaxedContact",
     "Result",
     "Scene",
@@ -156,6 +160,7 @@ __all__ = [
     "directional_derivative",
     "discretize",
     "energy",
+    "estimate_error",
     "estimate_memory",
     "export",
     "join",
@@ -169,6 +174,7 @@ __all__ = [
     "prepare",
     "read_mesh",
     "reduce",
+    "reduction_error",
     "reference",
     "scenes",
     "simulate",
