@@ -80,6 +80,7 @@ from jaxcontact.schemes import (
     RedistributedMass,
     Trapezoidal,
 )
+from jaxcontact.system.files import load_system
 from jaxcontact.system.reduction import reduce
 from jaxcontact.system.system import System, discretize
 from jaxcontact.transforms.time_loop import Checkpoint
@@ -160,6 +161,7 @@ __all__ = [
     "join",
     "l2_value_and_grad",
     "load_result",
+    "load_system",
     "meshes",
     "optimize",
     "phase_mean",

@@ -276,10 +276,10 @@ def _checked(system: System, mass: BlockMatrix) -> BlockMatrix:
 
 def _check_pairs(system: System) -> None:
     """Check that every contact pair is one node against an obstacle or another body."""
-    if system.size != system.dimension * len(system.free_nodes):
+    if system.basis is not None:
         raise ValueError(
-            "RedistributedMass needs the nodes of a mesh, not a reduced model; "
-            "use jc.ContactStabilized()"
+            "RedistributedMass moves mass from contact nodes to their neighbours, and the unknowns "
+            "of a reduced model belong to no node; use jc.ContactStabilized()"
         )
     nodes = np.asarray(system.contact_nodes)
     shared = nodes.size - np.unique(nodes).size

@@ -130,4 +130,4 @@ class RedistributedMass:
 
 def _is_coupled(system: System) -> bool:
     """Return whether a contact pair may be one of two bodies, so that N_R is not zero."""
-    return system.normals.unknowns.shape[1] > system.dimension
+    return system.normals.weights.shape[1] > system.dimension
