@@ -35,7 +35,7 @@ class ControlMap(Protocol):
     """Linear map from parameters to controls, a pytree; for instance an `Actuator`."""
 
     def __call__(self, parameters: Array) -> Array:
-        """Return the control (T, N, d)."""
+        """Return the control (T, N, d) or (T, n)."""
         ...
 
     def inner_product(
@@ -121,6 +121,11 @@ class Problem:
             )
         product = inner_product
         if product is None:
+            if bounds is not None and controls is None and start.ndim == 2:
+                raise ValueError(
+                    "bounds are those of nodal values, and a control in unknowns (T, n) has none; "
+                    "optimise the control (T, N, d), or hand over an inner_product"
+                )
             product = _product_of(system, dt, controls, is_bounded=bounds is not None)
         check_option(
             "inner_product", product, InnerProduct, "control.inner_product.Weighted(weights)"

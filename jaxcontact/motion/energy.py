@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.motion.checks import check_every_step
+from jaxcontact.motion.checks import check_control, check_every_step
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.schemes import Losses, StepState
 from jaxcontact.schemes.terms import viscous_loss
+from jaxcontact.system.control_space import control_loads
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -60,32 +61,47 @@ class Energy:
         return self.kinetic + self.elastic
 
 
-@in_full_precision
-@jax.jit
 def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = None) -> Energy:
     """Return the energy ledger of a trajectory.
 
     Args:
         stepper: the stepper that made the trajectory.
         trajectory: every state of it, T steps.
-        control: the control that made it, (T, N, d) [N/m^d].
+        control: the control that made it, (T, N, d) or (T, n) [N/m^d].
 
     Returns:
         Energies and flows; the identity of the module docstring holds to rounding.
 
     Raises:
-        ValueError: if the trajectory was recorded with a save_every other than 1.
+        ValueError: if the trajectory was recorded with a save_every other than 1, or is one of
+            another system, or the control has another shape.
     """
     check_every_step(trajectory)
+    unknowns, system = trajectory.unknowns, stepper.system
+    if unknowns.shape[1:] != (system.size,):
+        raise ValueError(
+            f"the trajectory has unknowns {unknowns.shape}, the system of the stepper "
+            f"{system.size}; hand over the stepper that made it"
+        )
+    if control is not None:
+        check_control(system, control)
+    return _ledger(stepper, unknowns, trajectory.rates, trajectory.contact_impulse, control)
+
+
+@in_full_precision
+@jax.jit
+def _ledger(
+    stepper: Stepper, unknowns: Array, rates: Array, impulse: Array, control: Array | None
+) -> Energy:
     system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
     def nothing_yet(record: Array) -> Array:
         return jnp.concatenate([jnp.zeros_like(record[:1]), record])
 
     states = StepState(
-        displacement=system.restrict(trajectory.displacement),
-        velocity=system.restrict(trajectory.velocity),
-        impulse=nothing_yet(trajectory.contact_impulse),
+        displacement=unknowns,
+        velocity=rates,
+        impulse=nothing_yet(impulse),
         guesses=(),
     )
 
@@ -95,9 +111,9 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         return kinetic, elastic
 
     def flow(
-        old: StepState, new: StepState, force: Array | None
+        old: StepState, new: StepState, added: Array | None
     ) -> tuple[Array, Array, Array, Losses]:
-        load = system.load if force is None else system.load + system.control_load(force)
+        load = system.load if added is None else system.load + added
         velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
         increment = new.displacement - old.displacement
         change = 0.5 * (
@@ -110,7 +126,8 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     kinetic, elastic = jax.lax.map(measure, states)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
-    change, work, viscous, losses = jax.lax.map(lambda step: flow(*step), (old, new, control))
+    loads = None if control is None else control_loads(system, control)
+    change, work, viscous, losses = jax.lax.map(lambda step: flow(*step), (old, new, loads))
     numerical = jnp.asarray(losses.numerical, change.dtype)
     return Energy(
         kinetic=kinetic,

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,12 @@ from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solut
 from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed, refuse_closed
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
+from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
+from jaxcontact.system.control_space import control_loads
 from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
@@ -44,7 +47,8 @@ def simulate(
 
     Args:
         stepper: from `prepare`.
-        control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or None.
+        control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or in
+            the unknowns of the system, (T, n), see `System.restrict_control`; or None.
         steps: number of steps T; default the length of the control.
         initial: state at time zero; default at rest without displacement.
         save_every: number of steps k between recorded states, a divisor of T: displacement,
@@ -90,10 +94,27 @@ def simulate(
         stepper = _open_along(stepper, control, initial, steps, weak_contact)
         weak_contact = ClosedBranch()
     with _forward_mode_advice():
-        trajectory = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
+        motion = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
+    nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
+    trajectory = Trajectory(**motion._asdict(), nodal=nodal)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
+
+
+class _Motion(NamedTuple):
+    """A `Trajectory` without its nodal fields."""
+
+    dt: Array
+    time: Array
+    unknowns: Array
+    rates: Array
+    gap: Array
+    contact_impulse: Array
+    contact: ContactRecord
+    iterations: Array
+    status: Array
+    residual: Array
 
 
 @in_full_precision
@@ -106,7 +127,7 @@ def _run(
     steps: int,
     save_every: int,
     checkpoint: Checkpoint | None,
-) -> Trajectory:
+) -> _Motion:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
     start = first_state(
@@ -117,9 +138,15 @@ def _run(
         system.restrict(initial.velocity),
     )
 
+    if control is not None and system.basis is not None:
+        # One product with the basis for all steps, not one in each of them.
+        control = control_loads(system, control)
+
     def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation]):
         force, perturbation = inputs
-        load = system.load if force is None else system.load + system.control_load(force)
+        load = system.load
+        if force is not None:
+            load = load + (force if system.basis is not None else system.control_load(force))
         load = load if perturbation.load is None else load + perturbation.load
         perturbed = perturbation.on(operators, dt)
         result = stepper.scheme.step(system, perturbed, dt, state, load)
@@ -137,13 +164,12 @@ def _run(
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
-    velocity = jnp.concatenate([start.velocity[None], states.velocity])
     normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
-    return Trajectory(
+    return _Motion(
         dt=dt,
         time=dt * jnp.arange(0, steps + 1, save_every),
-        displacement=system.lift(displacement),
-        velocity=system.lift(velocity),
+        unknowns=displacement,
+        rates=jnp.concatenate([start.velocity[None], states.velocity]),
         gap=system.gap[None, :] - normal_displacement,
         contact_impulse=impulse,
         contact=contact,

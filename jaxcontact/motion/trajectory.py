@@ -1,4 +1,7 @@
-"""What a simulation returns, and what it may start from."""
+"""What a simulation returns, and what it may start from.
+
+A motion is recorded in its unknowns, and nodal fields are lifted from them when they are asked for.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+from jaxcontact.motion.nodal_fields import NodalFields
 
 
 @jax.tree_util.register_dataclass
@@ -55,7 +60,7 @@ class ContactRecord:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """The motion of a body over T steps; N nodes, C contact pairs, dimension d."""
+    """The motion of a body over T steps; n unknowns, N nodes, C contact pairs, dimension d."""
 
     dt: Array
     """Length of a time step, scalar [s]."""
@@ -63,11 +68,15 @@ class Trajectory:
     time: Array
     """Time levels, (T+1,) [s]."""
 
-    displacement: Array
-    """Nodal displacement, (T+1, N, d) [m]."""
+    unknowns: Array
+    """The unknowns of the system, (T+1, n): free displacement components [m], or coordinates in the
+    space of a reduced model [m kg^1/2]."""
 
-    velocity: Array
-    """Nodal velocity, (T+1, N, d) [m/s]."""
+    rates: Array
+    """Velocity of the unknowns, (T+1, n)."""
+
+    nodal: NodalFields
+    """What `displacement` and `velocity` are taken from."""
 
     gap: Array
     """Distance to the obstacle along the normal, (T+1, C) [m]; never negative beyond rounding."""
@@ -86,6 +95,16 @@ class Trajectory:
 
     residual: Array
     """KKT residual of each step relative to the largest violation of its free motion, (T,)."""
+
+    @property
+    def displacement(self) -> Array:
+        """Nodal displacement, (T+1, N, d) [m]; lifted from the unknowns when it is asked for."""
+        return self.nodal.displacement
+
+    @property
+    def velocity(self) -> Array:
+        """Nodal velocity, (T+1, N, d) [m/s]; lifted when it is asked for."""
+        return self.nodal.velocity
 
     @property
     def contact_force(self) -> Array:
@@ -136,4 +155,4 @@ class Trajectory:
     @property
     def final(self) -> State:
         """The state after the last step."""
-        return State(self.displacement[-1], self.velocity[-1])
+        return State(*self.nodal.at(-1))

@@ -20,6 +20,8 @@ from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clampe
 from jaxcontact.system import assembly
 from jaxcontact.system.basis import Basis
 from jaxcontact.system.contact_pairs import contact_pairs
+from jaxcontact.system.control_space import control_loads, solve_mass
+from jaxcontact.system.lift import Lift
 from jaxcontact.system.pair_set import PairSet, pair_numbers
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
@@ -163,7 +165,13 @@ class System:
 
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
-        return _lift(self, x)
+        return self.lifting(x)
+
+    @property
+    def lifting(self) -> Lift:
+        """What `lift` needs of the system, without its matrices."""
+        vectors = None if self.basis is None else self.basis.vectors
+        return Lift(self.node_numbers, vectors, self.dimension, self.is_clamped)
 
     @in_full_precision
     @jax.jit
@@ -183,9 +191,20 @@ class System:
 
     @in_full_precision
     def control_load(self, control: Array) -> Array:
-        """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
+        """Return the load (n,) [N] of a force density (N, d) or (n,) [N/m^d]: L u of MATH.md 1."""
+        if control.ndim == 1:
+            return self.l2_mass @ control
         load = self.free_components(self.nodal_mass @ control)
         return load if self.basis is None else load @ self.basis.vectors
+
+    def restrict_control(self, control: Array) -> Array:
+        """Return the control (T, n) in unknowns that acts as a control (T, N, d) [N/m^d].
+
+        It is c with L_n c = V^T L u, the L2 projection: its load is the same, and `lift` makes it
+        nodal. An optimal control of a reduced model is of this kind: it is a multiple of the
+        adjoint state, which lies in the space.
+        """
+        return solve_mass(self.l2_mass, control_loads(self, control))
 
 
 @in_full_precision
@@ -273,16 +292,3 @@ def _check_dtype(dtype) -> None:
             "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
             "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
         )
-
-
-@in_full_precision
-@jax.jit
-def _lift(system: System, x: Array) -> Array:
-    if system.basis is not None:
-        x = x @ system.basis.vectors.T
-    free = x.reshape(*x.shape[:-1], -1, system.dimension)
-    if not system.is_clamped:
-        return free
-    padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
-    free = jnp.concatenate([free, padding], axis=-2)
-    return jnp.take(free, system.node_numbers, axis=-2, mode="clip")
