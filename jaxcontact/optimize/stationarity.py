@@ -28,7 +28,7 @@ def stationarity(
     controls: ControlMap | Callable[[Array], Array] | None = None,
     inner_product: InnerProduct | None = None,
     motion: Callable[[Array], Trajectory] | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float | None = None,
 ) -> Stationarity:
     """Certify a control on the exact problem: is it strongly stationary, (4.32)-(4.33)?
 
