@@ -71,6 +71,7 @@ from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.scene.quality import MeshQuality
 from jaxcontact.scene.scene import Scene
 from jaxcontact.schemes import (
     BackwardEuler,
@@ -79,6 +80,7 @@ from jaxcontact.schemes import (
     RedistributedMass,
     Trapezoidal,
 )
+from jaxcontact.system.files import load_system
 from jaxcontact.system.reduction import reduce
 from jaxcontact.system.system import System, discretize
 from jaxcontact.transforms.time_loop import Checkpoint
@@ -112,6 +114,7 @@ __all__ = [
     "KelvinVoigt",
     "MemoryEstimate",
     "Mesh",
+    "MeshQuality",
     "NestedDissection",
     "NewtonCG",
     "OpenBranch",
@@ -158,6 +161,7 @@ __all__ = [
     "join",
     "l2_value_and_grad",
     "load_result",
+    "load_system",
     "meshes",
     "optimize",
     "phase_mean",

@@ -13,7 +13,8 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
-from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed
+from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed, refuse_closed
+from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
@@ -61,8 +62,9 @@ def simulate(
         ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
             finite, the recorded states are more than twice the memory of all devices, or the
             initial state penetrates an obstacle or moves a clamped node.
-        SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
-            the trajectory is NaN from that step on instead.
+        SolveError: if a step was not solved, or closes a pair that is taken to stay open, and the
+            result is concrete; under jit, grad or vmap the trajectory is NaN from that step on
+            instead.
 
     Derivative: reverse mode of every order by control, initial state and every value of the
     stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
@@ -111,7 +113,7 @@ def _run(
         stepper.scheme,
         system,
         operators,
-        system.restrict(initial.displacement),
+        first_displacement(system, initial.displacement, weak_contact),
         system.restrict(initial.velocity),
     )
 
@@ -121,9 +123,11 @@ def _run(
         load = load if perturbation.load is None else load + perturbation.load
         perturbed = perturbation.on(operators, dt)
         result = stepper.scheme.step(system, perturbed, dt, state, load)
+        iterations, status, residual = _worst(result.solutions)
+        result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
             result.impulse,
-            _worst(result.solutions),
+            (iterations, status, residual),
             _record(dt, result.solutions),
         )
 

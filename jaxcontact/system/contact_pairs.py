@@ -16,13 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.obstacle import Obstacle, gap_and_normals, position_sizes
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.block_matrix import concatenate
 from jaxcontact.system.mortar import mortar_rows
-from jaxcontact.system.pairing import direction_of, end_signs, find_meeting
+from jaxcontact.system.pairing import direction_of, find_meeting
 from jaxcontact.transforms.traced import is_traced
 
 #: Normals that differ by no more than this times the unit roundoff are equal.
@@ -128,7 +129,7 @@ def _body_pairs(
 ) -> ContactPairs:
     """Return the pairs of facets (F, d) of the named contact sets that may touch another body."""
     meeting = find_meeting(names, facets, other, scene.mesh, is_free)
-    rows = mortar_rows(points, facets, end_signs(scene.mesh), direction_of(other), meeting)
+    rows = mortar_rows(points, facets, end_signs(scene.mesh.cells), direction_of(other), meeting)
     places = jnp.asarray(points[meeting.nodes])
     both = jnp.max(2.0 * jnp.abs(places) + jnp.abs(rows.gap)[:, None], axis=0)
     rounding = _rounding(rows.gap, rows.normals, both, dtype)

@@ -8,6 +8,7 @@ on the n unknowns: the displacement components of the nodes that are not clamped
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +18,13 @@ from numpy.typing import ArrayLike
 
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
 from jaxcontact.system import assembly
+from jaxcontact.system.basis import Basis
 from jaxcontact.system.contact_pairs import contact_pairs
+from jaxcontact.system.pair_set import PairSet, pair_numbers
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
-from jaxcontact.transforms.traced import as_array
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Basis:
-    """The space of a reduced model: y = vectors q, with M-orthonormal vectors."""
-
-    vectors: Array
-    """Basis vectors, (n_full, n): displacement components of the free nodes."""
-
-    projector: Array
-    """M vectors, (n_full, n): q = projector^T y is the M-orthogonal projection."""
+from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.traced import as_array, take_rows
 
 
 @jax.tree_util.register_dataclass
@@ -41,7 +33,7 @@ class System:
     """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
 
     mass: ComponentwiseMatrix | SymmetricMatrix
-    """M, consistent mass matrix with density, (n, n) [kg]; dense in a reduced model."""
+    """M, consistent mass matrix with density, (n, n) [kg]; the identity in a reduced model."""
 
     stiffness: SymmetricMatrix
     """A, elastic stiffness matrix, (n, n) [N/m]."""
@@ -90,6 +82,9 @@ class System:
     basis: Basis | None = None
     """Space of a reduced model (see `reduce`); None is all displacement components."""
 
+    open_pairs: PairSet | None = None
+    """Pairs that are taken to stay open (see `with_pairs`); None is none."""
+
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
@@ -128,6 +123,44 @@ class System:
         rounding = jnp.maximum(self.gap_rounding, jax.lax.stop_gradient(own))
         return replace(self, gap=gap, gap_rounding=rounding)
 
+    def save(self, path: str | Path) -> None:
+        """Write the system to an .npz file, which `load_system` reads.
+
+        If the writing fails or is killed, a file that was there before is still there.
+
+        Raises:
+            ValueError: if the system is traced.
+            OSError: if the file cannot be written.
+        """
+        save_dataclass(path, self)
+
+    def with_pairs(self, pairs: ArrayLike) -> System:
+        """Return the system with contact on some of its pairs only; the others stay open.
+
+        A pair out of reach then costs no part of the contact problem. The motion is exact or
+        refused: `simulate` looks at the gap of the others in every step, and where one of them
+        would penetrate, that step has failed.
+
+        Args:
+            pairs: which pairs can touch: (C,) bool, for instance `system.gap < reach` or
+                `jnp.any(trajectory.active, axis=0)`, or their numbers; concrete.
+
+        Raises:
+            ValueError: if the pairs are traced or are not among those of the system.
+        """
+        kept = pair_numbers(pairs, self.normals.count)
+        rest = np.setdiff1d(np.arange(self.normals.count), kept)
+        return replace(
+            self,
+            normals=self.normals.rows(kept),
+            gap=take_rows(self.gap, kept),
+            gap_rounding=take_rows(self.gap_rounding, kept),
+            contact_nodes=take_rows(self.contact_nodes, kept),
+            contact_area=take_rows(self.contact_area, kept),
+            basis=None if self.basis is None else self.basis.with_pairs(kept),
+            open_pairs=PairSet.of(self, rest, self.open_pairs),
+        )
+
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
         return _lift(self, x)
@@ -139,13 +172,19 @@ class System:
 
         Of a reduced model, the unknowns of the M-orthogonal projection.
         """
-        free = _free_components(self, y)
-        return free if self.basis is None else free @ self.basis.projector
+        free = self.free_components(y)
+        return free if self.basis is None else self.basis.restrict(free)
+
+    def free_components(self, y: Array) -> Array:
+        """Return the components (..., n_full) of the free nodes of a nodal field (..., N, d)."""
+        if self.is_clamped:
+            y = jnp.take(y, self.free_nodes, axis=-2, mode="clip")
+        return y.reshape(*y.shape[:-2], -1)
 
     @in_full_precision
     def control_load(self, control: Array) -> Array:
         """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
-        load = _free_components(self, self.nodal_mass @ control)
+        load = self.free_components(self.nodal_mass @ control)
         return load if self.basis is None else load @ self.basis.vectors
 
 
@@ -234,12 +273,6 @@ def _check_dtype(dtype) -> None:
             "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
             "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
         )
-
-
-def _free_components(system: System, y: Array) -> Array:
-    if system.is_clamped:
-        y = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
-    return y.reshape(*y.shape[:-2], -1)
 
 
 @in_full_precision
