@@ -51,7 +51,7 @@ def _solve_forward(
     assert fixed.guess is not None
     if fixed.closed is not None:
         w, p = solve_on_cone(values, weights, fixed, fixed.closed, None, rhs, bound)
-        return w, _on_pattern(fixed, fixed.guess, p)
+        return w, _on_pattern(fixed.closed, fixed.guess, p)
     return fixed.form.solve(rhs, bound, fixed.resolution, fixed.guess)
 
 
@@ -98,12 +98,12 @@ def by_compliance(compliance: Array, softness: Array, multiplier: Array) -> Arra
     return softness * multiplier / compliance
 
 
-def _on_pattern(fixed: Fixed, guess: Guess, multiplier: Array) -> Solution:
+def _on_pattern(closed: Array, guess: Guess, multiplier: Array) -> Solution:
     """Return the solution for given closed pairs; nothing is iterated, no sign is asked for."""
     is_finite = jnp.all(jnp.isfinite(multiplier))
     status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
     nothing = jnp.zeros((), multiplier.dtype)
-    return Solution(multiplier, fixed.closed, jnp.int32(0), status, nothing, guess.workspace)
+    return Solution(multiplier, closed, jnp.int32(0), status, nothing, guess.workspace)
 
 
 def _not_open(fixed: Fixed, pairs: Array) -> Array:

@@ -27,37 +27,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.contact import RelaxedContact
 from jaxcontact.control.problem import Problem
 from jaxcontact.derivative.weak import contact_sizes
-from jaxcontact.motion.stepper import (
-    Stepper,
-    StepPerturbation,
-    with_contact,
-    with_perturbation,
-)
+from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_perturbation
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.optimize.certificate import on_pattern, run
+from jaxcontact.optimize.pattern import Pattern, Signs, pivoted, worst_alone
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 from jaxcontact.optimize.weak_rows import WeakRows, weak_rows, wrong_signs
 from jaxcontact.transforms.trees import nodes
 
 #: Gaps and impulses below this times those of the motion are zero: rounding of many steps.
 ROUNDING = 1e-12
-
-
-class Pattern(NamedTuple):
-    """The contact of a motion: T steps, P contact problems of a step, C pairs."""
-
-    strong: np.ndarray
-    """Closed pairs, (T, P, C) bool."""
-
-    weak: np.ndarray
-    """Pairs whose gap is held at zero without an impulse, (T, P, C) bool; none of them strong."""
-
-    def key(self) -> bytes:
-        """Return what tells one pattern from another."""
-        return np.packbits(self.strong).tobytes() + np.packbits(self.weak).tobytes()
 
 
 class Finished(NamedTuple):
@@ -74,20 +55,6 @@ class Finished(NamedTuple):
 
     is_right: bool
     """Whether all signs are right, and the residual small."""
-
-
-class _Signs(NamedTuple):
-    """By how much every pair has the wrong sign, (T, P, C), and what it becomes; 0 is right."""
-
-    to_open: np.ndarray
-    weak_to_strong: np.ndarray
-    strong_to_weak: np.ndarray
-    open_to_weak: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """Number of pairs with a wrong sign."""
-        return int(sum(np.sum(part > 0.0) for part in self))
 
 
 @dataclass(frozen=True)
@@ -144,9 +111,9 @@ class ExactFinish:
             fewest = min(fewest, signs.count)
             if signs.count == 0 or patience == 0 or len(seen) == self.max_pivots:
                 return Finished(parameters, pattern, found.residual, is_right)
-            following = _pivoted(pattern, signs)
+            following = pivoted(pattern, signs)
             if following.key() in seen:
-                following = _pivoted(pattern, _worst(signs))
+                following = pivoted(pattern, worst_alone(signs))
             if following.key() in seen:
                 return Finished(parameters, pattern, found.residual, False)
             pattern = following
@@ -260,7 +227,7 @@ class _OnPattern:
         """Return the gaps of the weak pairs, (m,) [m]."""
         return np.asarray(self.trajectory(parameters).contact.gap)[self.pattern.weak]
 
-    def signs(self, found: _Minimum) -> _Signs:
+    def signs(self, found: _Minimum) -> Signs:
         """Return what is wrong with the pattern."""
         strong, weak = self.pattern
         pi = found.by_impulse - self.rows.compliance.T @ found.nu
@@ -272,7 +239,7 @@ class _OnPattern:
         lam, gap = (np.asarray(x) for x in (contact.multiplier, contact.gap))
         pulled = -lam / self.sizes[1]
         inside = -gap / self.sizes[0]
-        return _Signs(
+        return Signs(
             to_open,
             to_strong,
             np.where(strong & (pulled > ROUNDING), pulled, 0.0),
@@ -285,47 +252,3 @@ def _spread(places: np.ndarray, values: np.ndarray) -> np.ndarray:
     spread = np.zeros(places.shape)
     spread[places] = values
     return spread
-
-
-def _pivoted(pattern: Pattern, signs: _Signs) -> Pattern:
-    """Return the pattern with every pair moved whose sign is wrong."""
-    to_open, to_strong, strong_to_weak, open_to_weak = (part > 0.0 for part in signs)
-    strong = (pattern.strong & ~strong_to_weak) | to_strong
-    weak = (pattern.weak & ~to_open & ~to_strong) | strong_to_weak | open_to_weak
-    return Pattern(strong, weak)
-
-
-def _worst(signs: _Signs) -> _Signs:
-    """Return the signs with the worst pair alone: each kind has its own unit, so of the first."""
-    kind = int(np.argmax([np.sum(part > 0.0) > 0 for part in signs]))
-    worst = np.unravel_index(np.argmax(signs[kind]), signs[kind].shape)
-    alone = [np.zeros_like(part) for part in signs]
-    alone[kind][worst] = signs[kind][worst]
-    return _Signs(*alone)
-
-
-def identify(
-    problem: Problem,
-    motion: Callable[[Array], Trajectory],
-    levels: tuple[tuple[float, Array], tuple[float, Array]],
-    band: tuple[float, float] = (0.35, 0.65),
-) -> Pattern:
-    """Return the pattern that the gaps of two relaxed minimisers tend to.
-
-    A gap tends to zero like kappa^e: e = 0 of an open pair, 1 of a strong one, 1/2 of a weak one,
-    whose gap and impulse vanish alike.
-
-    Args:
-        problem: for its control map.
-        motion: maps a control to its trajectory; a pytree that holds the stepper.
-        levels: kappa and parameters of two minimisers in relaxed contact.
-        band: exponents that count as weak.
-    """
-    gaps = []
-    for kappa, parameters in levels:
-        relaxed = with_contact(motion, RelaxedContact(kappa))
-        gaps.append(np.asarray(run(relaxed, problem.controls, parameters).contact.gap))
-        problem.counts.motions += 1
-    first, second = (np.log(np.maximum(gap, np.finfo(gap.dtype).tiny)) for gap in gaps)
-    exponent = (first - second) / math.log(levels[0][0] / levels[1][0])
-    return Pattern(exponent >= band[1], (exponent > band[0]) & (exponent < band[1]))

@@ -4,8 +4,9 @@
 
 by trust-region Newton-CG for a decreasing sequence of kappa, each started at the last minimiser.
 J_kappa is smooth, its Hessian products are exact, and on weak contact its adjoint tends to the one
-with the right share of the multiplier: the path ends at strong stationarity, where methods for
-the exact problem stall at kinks. Source: MATH.md 5.
+with the right share of the multiplier: the path leads to strong stationarity, where methods for
+the exact problem stall at kinks. Its gaps tell which pairs are weak there, and an exact finish does
+the rest (`finish.py`), so the first problems are solved loosely. Source: MATH.md 5.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from jaxcontact.contact import RelaxedContact
 from jaxcontact.control.problem import Point, Problem
 from jaxcontact.motion.stepper import with_contact
 from jaxcontact.optimize.certificate import motion_of
-from jaxcontact.optimize.finish import ExactFinish, identify
+from jaxcontact.optimize.finish import ExactFinish
 from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
+from jaxcontact.optimize.pattern import identify
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
 #: The first relaxation changes the objective at the start by about this fraction.
@@ -83,9 +85,11 @@ class HomotopyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Homotopy:
-    """Newton-CG on relaxed contact with kappa -> 0; the method that converges at kinks.
+    """Newton-CG on relaxed contact with kappa -> 0, and an exact finish: for minimisers at kinks.
 
-    One iteration of `optimize` is one kappa; values in the history are those of the exact problem.
+    One iteration of `optimize` is one kappa, or one finish; values in the history are those of the
+    exact problem. It ends as `Ending.CERTIFIED` at a control that is strongly stationary to
+    rounding: see `Stationarity.is_strong` for what that proves.
 
     The contact solver is exchanged inside the objective, so the objective must be a pytree that
     holds the stepper: a bound method of a registered dataclass, such as
@@ -100,7 +104,7 @@ class Homotopy:
     """Factor from one kappa to the next."""
 
     levels: int = 13
-    """Number of kappas. The error of the last solution is about the root of the last kappa."""
+    """Most kappas. Without the finish, the error is about the root of the last one."""
 
     tolerance: float = 1e-9
     """Each relaxed problem is solved to this times the gradient norm at the start; with a finish
@@ -133,12 +137,15 @@ class Homotopy:
         if state.is_certified:
             return state, Ending.CERTIFIED
         motion = motion_of(problem)
-        finish = self.finish if problem.bounds is None and motion is not None else None
-        if finish is not None and state.level >= max(self.finish_from, state.finish_level + 1, 2):
-            return self._finished(problem, state, finish, motion), None
+        first = max(self.finish_from, 2)  # two levels tell where the path leads
+        finish = self.finish if problem.bounds is None and self.levels >= first else None
+        if finish is not None and motion is not None:
+            if state.level >= max(first, state.finish_level + 1):
+                return self._finished(problem, state, finish, motion), None
         if state.level == self.levels:
             return state, Ending.RELAXED
-        return self._next_level(problem, state, is_loose=finish is not None)
+        is_loose = finish is not None and motion is not None
+        return self._next_level(problem, state, is_loose)
 
     def _next_level(
         self, problem: Problem, state: HomotopyState, is_loose: bool
