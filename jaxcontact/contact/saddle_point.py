@@ -42,7 +42,7 @@ class Fixed(NamedTuple):
     is_open: Array | None
     """Pairs that are open in the derivative whatever their state, (C,) bool; None is none."""
 
-    closed: Array | None
+    closed: Array | None = None
     """The pairs that are closed in motion and derivative, (C,) bool; None lets contact decide."""
 
 
