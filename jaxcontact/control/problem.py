@@ -69,7 +69,13 @@ class Counts:
     """Evaluations of value and gradient."""
 
     hessian_products: int = 0
-    """Products with the Hessian."""
+    """Products with the Hessian; to linearise the motion for them counts as one."""
+
+    rows: int = 0
+    """Derivatives of the gap of one pair in one step."""
+
+    motions: int = 0
+    """Simulations without a derivative."""
 
 
 @dataclass(frozen=True)
@@ -159,11 +165,21 @@ class Problem:
         value = jnp.where(is_finite, value, jnp.inf)
         return Point(parameters, value, derivative, gradient)
 
-    def hessian_product(self, parameters: Array, direction: Array) -> Array:
-        """Return the Hessian (one of a semismooth J) times a direction, a covector."""
+    def hessian(self, parameters: Array) -> Callable[[Array], Array]:
+        """Return the Hessian (one of a semismooth J): maps a direction to a covector.
+
+        The motion is linearised once, so that a product is one sweep forward and one back.
+        """
         self.counts.hessian_products += 1
-        multiply = _hessian_product_compiled if self.is_compiled else _hessian_product
-        return multiply(self.objective, self.controls, parameters, direction)
+        linearize = _linearized_gradient_compiled if self.is_compiled else _linearized_gradient
+        linear = linearize(self.objective, self.controls, parameters)
+        apply = _apply_compiled if self.is_compiled else _apply
+
+        def product(direction: Array) -> Array:
+            self.counts.hessian_products += 1
+            return apply(linear, direction)
+
+        return product
 
     def riesz(self, covector: Array) -> Array:
         """Return the vector that represents a covector."""
@@ -216,9 +232,12 @@ def _evaluate(objective, controls, product, parameters):
     return value, derivative, gradient, is_finite
 
 
-def _hessian_product(objective, controls, parameters, direction):
-    derivative = jax.grad(lambda p: objective(controls(p)))
-    return jax.jvp(derivative, (parameters,), (direction,))[1]
+def _linearized_gradient(objective, controls, parameters):
+    return jax.linearize(jax.grad(lambda p: objective(controls(p))), parameters)[1]
+
+
+def _apply(linear, direction):
+    return linear(direction)
 
 
 @jax.jit
@@ -233,4 +252,5 @@ def _riesz(product, covector):
 
 # Module-level, so that a second optimisation of the same problem compiles nothing.
 _evaluate_compiled = jax.jit(_evaluate)
-_hessian_product_compiled = jax.jit(_hessian_product)
+_linearized_gradient_compiled = jax.jit(_linearized_gradient)
+_apply_compiled = jax.jit(_apply)
