@@ -1,12 +1,12 @@
 """What does a reduced model cost, and how wrong is it?
 
 The half disc of the paper under two loads: A, 0.7 times the uniform reference control, and B,
-smooth in space and time, not symmetric and stronger; and a half ball in three dimensions,
-where modes buy much less. Errors are those against the full model on the same mesh and step: of the
-displacement (largest L2 norm over time), of the accumulated impulse, of the force of each step (sum of absolute
-values over the impulse) and of the gradient of the tracking cost (L2, without the control's own
-part). Times: forward, value and gradient with the control on all nodes or in unknowns, a whole
-optimisation with the full cost at its minimiser, and a batch.
+smooth in space and time, not symmetric and stronger; and a half ball in three dimensions, where
+modes buy much less. Errors are those against the full model on the same mesh and step: of the
+displacement (largest L2 norm over time), of the accumulated impulse, of the force of each step
+(sum of absolute values over the impulse) and of the gradient of the tracking cost (L2, without
+the control's own part). Times: forward, value and gradient with the control on all nodes or in
+unknowns, a whole optimisation with the full cost at its minimiser, and a batch.
 """
 
 from __future__ import annotations
