@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from jaxcontact import reference
 from jaxcontact.accuracy.estimate import ErrorEstimate, estimate_error
+from jaxcontact.accuracy.recommend import Recommendation, recommend
 from jaxcontact.accuracy.reduction_error import ReductionError, reduction_error
 from jaxcontact.contact import (
     AlongDirection,
@@ -126,6 +127,7 @@ __all__ = [
     "Optax",
     "PhaseMean",
     "ProjectedGaussSeidel",
+    "Recommendation",
     "RedistributedMass",
     "ReductionError",
     "RelaxedContact",
@@ -175,6 +177,7 @@ __all__ = [
     "plot",
     "prepare",
     "read_mesh",
+    "recommend",
     "reduce",
     "reduction_error",
     "reference",
