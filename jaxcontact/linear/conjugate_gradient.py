@@ -238,8 +238,8 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if the model is a reduced one, or the values are concrete and so ill-conditioned
-                that no solve could succeed.
+            ValueError: if the model is a reduced one, or the values are concrete and so
+                ill-conditioned that no solve could succeed.
         """
         if normals.unknowns is None:
             raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
