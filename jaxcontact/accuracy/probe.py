@@ -51,6 +51,21 @@ class Choice(NamedTuple):
     """Whether it is the enriched model of a reduced one, see `reduction_error`."""
 
 
+def number_of(found: Array | float | tuple[Array | float, Trajectory]) -> float:
+    """Return the number of what a quantity returned.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    number = found[0] if isinstance(found, tuple) else found
+    if np.shape(number) != ():
+        raise ValueError(
+            "the quantity must be a number, or (number, trajectory), got an array of shape "
+            f"{np.shape(number)}"
+        )
+    return float(number)
+
+
 @dataclass
 class Probes:
     """The runs so far: no choice is run twice."""
@@ -79,13 +94,8 @@ class Probes:
             begin = time.perf_counter()
             found = self.quantity(self.stepper(choice))
             if isinstance(found, tuple):
-                found, self.trajectories[choice] = found
-            if np.shape(found) != ():
-                raise ValueError(
-                    f"the quantity must be a number, or (number, trajectory), got an array of "
-                    f"shape {np.shape(found)}"
-                )
-            self.values[choice] = float(found)
+                self.trajectories[choice] = found[1]
+            self.values[choice] = number_of(found)
             self.seconds += time.perf_counter() - begin
         return self.values[choice]
 

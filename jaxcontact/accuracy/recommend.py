@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcontact.accuracy.estimate import ErrorEstimate, parts_of_error
 from jaxcontact.accuracy.limits import limits
-from jaxcontact.accuracy.probe import Build, Choice, Probes, Quantity
+from jaxcontact.accuracy.probe import Build, Choice, Probes, Quantity, number_of
 from jaxcontact.output.axes import add_grid, make_axes
 from jaxcontact.schemes import ContactImplicit, ContactStabilized, Scheme
 from jaxcontact.system.system import System
@@ -153,7 +153,8 @@ def recommend(
             its size, a mean over time and not an end value that may vanish.
         schemes: the time-stepping schemes to choose from.
         budget: seconds that the probes may take, compilation included; default 300.
-        h: the coarsest mesh size, [m]; default four cells in the length of the body.
+        h: the coarsest mesh size, [m]; default a quarter of the length of the body, which is
+            measured on the mesh of `build(1.0)`.
         dt: the longest time step, [s]; default the time of a wave through a cell of that mesh.
 
     Returns:
@@ -175,10 +176,12 @@ def recommend(
     dtype = jnp.dtype(float if jax.config.read("jax_enable_x64") else jnp.float32)
     first = Choice(h, 1.0, schemes[0], dtype)
     dt = _wave_time(probes.system(first)) if dt is None else float(dt)
-    deadline = time.perf_counter() + (BUDGET if budget is None else float(budget))
+    begin, budget = time.perf_counter(), BUDGET if budget is None else float(budget)
+    deadline = begin + budget
     evidence: list[Evidence] = []
-    for scheme in schemes:
-        _refine(probes, first._replace(dt=dt, scheme=scheme), tolerance, deadline, evidence)
+    for k, scheme in enumerate(schemes, start=1):
+        share = begin + budget * k / len(schemes)
+        _refine(probes, first._replace(dt=dt, scheme=scheme), tolerance, share, evidence)
     enough = [x for x in evidence if x.is_enough]
     if enough:
         enough = [y for x in enough for y in _reduced(probes, x, tolerance, deadline, evidence)]
@@ -228,7 +231,11 @@ def _refine(
             gain["h"] = 0.0
         if error.time <= NEGLIGIBLE * allowed:
             gain["dt"] = 0.0
-        is_mesh = gain["h"] >= gain["dt"]
+        # Within the tolerance on the coarsest mesh, or else what refining does not mend.
+        is_met = error.total <= allowed
+        if not is_met and not any(gain.values()):
+            return
+        is_mesh = is_met or gain["h"] >= gain["dt"]
         choice = choice._replace(h=choice.h / 2) if is_mesh else choice._replace(dt=choice.dt / 2)
 
 
@@ -257,9 +264,9 @@ def _reduced(
 def _seconds(probes: Probes, choice: Choice) -> float:
     """Return the time of a run that is compiled already, [s]."""
     stepper = probes.stepper(choice)
-    jax.block_until_ready(probes.quantity(stepper))
+    number_of(probes.quantity(stepper))
     begin = time.perf_counter()
-    jax.block_until_ready(probes.quantity(stepper))
+    number_of(probes.quantity(stepper))
     return time.perf_counter() - begin
 
 
