@@ -39,8 +39,10 @@ from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
 from jaxcontact.motion.pressure import contact_pressure
+from jaxcontact.motion.schedule import Schedule, sample
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
+from jaxcontact.motion.step import step
 from jaxcontact.motion.stepper import Stepper, prepare, with_contact
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.optimize import (
@@ -121,6 +123,7 @@ __all__ = [
     "RelaxedContact",
     "Result",
     "Scene",
+    "Schedule",
     "SemismoothNewton",
     "SignedDistance",
     "SmoothedContact",
@@ -164,10 +167,12 @@ __all__ = [
     "read_mesh",
     "reduce",
     "reference",
+    "sample",
     "scenes",
     "simulate",
     "solve_static",
     "stationarity",
+    "step",
     "with_contact",
 ]
 

@@ -4,7 +4,8 @@ With E = 1/2 v.Mv + 1/2 y.Ay, each step of a scheme satisfies an identity
 
     E' - E = work - viscous loss - impact loss - numerical loss        (to rounding)
 
-with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2.
+with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2; for supports and
+obstacles that move `motion/drive.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.motion.checks import check_every_step
+from jaxcontact.motion.drive import StepDrive, drive_of, every_step, flow_of_drive
 from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.supports import Flow, Moves, support_energy
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.schemes import Losses, StepState
+from jaxcontact.schemes import StepState
 from jaxcontact.schemes.terms import viscous_loss
 from jaxcontact.transforms.precision import in_full_precision
 
@@ -39,7 +42,8 @@ class Energy:
     those of y.Ay, whose terms are (L/h)^2 times as large as their sum."""
 
     work: Array
-    """Work of control, body force and traction in each step, (T,) [J]."""
+    """Work of control, body force, traction, pressure, and of supports and obstacles that move, in
+    each step, (T,) [J]."""
 
     viscous_loss: Array
     """Energy dissipated by the viscosity in each step, (T,) [J], not negative."""
@@ -67,7 +71,7 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
 
     Args:
         stepper: the stepper that made the trajectory.
-        trajectory: every state of it, T steps.
+        trajectory: every state of it, T steps; it knows the schedule that made it.
         control: the control that made it, (T, N, d) [N/m^d].
 
     Returns:
@@ -89,14 +93,19 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         guesses=(),
     )
 
-    def measure(state: StepState) -> tuple[Array, Array]:
+    drive = shapes = None
+    if trajectory.schedule is not None:
+        drive, shapes = drive_of(system, dt, trajectory.schedule)
+
+    def measure(state: StepState, moves: Moves | None) -> tuple[Array, Array]:
         kinetic = 0.5 * jnp.dot(state.velocity, operators.mass @ state.velocity)
         elastic = 0.5 * jnp.dot(state.displacement, system.stiffness @ state.displacement)
-        return kinetic, elastic
+        if shapes is None or shapes.supports is None or moves is None:
+            return kinetic, elastic
+        more = support_energy(shapes.supports, state, moves)
+        return kinetic + more[0], elastic + more[1]
 
-    def flow(
-        old: StepState, new: StepState, force: Array | None
-    ) -> tuple[Array, Array, Array, Losses]:
+    def flow(old: StepState, new: StepState, force: Array | None, step: StepDrive | None) -> Flow:
         load = system.load if force is None else system.load + system.control_load(force)
         velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
         increment = new.displacement - old.displacement
@@ -105,20 +114,27 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
             + jnp.dot(increment, system.stiffness @ displacement)
         )
         losses = stepper.scheme.losses(system, operators, dt, old, new)
-        return change, jnp.dot(increment, load), viscous_loss(system, dt, increment), losses
+        numerical = jnp.asarray(losses.numerical, change.dtype)
+        viscous = viscous_loss(system, dt, increment)
+        own = Flow(change, jnp.dot(increment, load), viscous, losses.impact, numerical)
+        if shapes is None or step is None:
+            return own
+        more = flow_of_drive(stepper.scheme, system, dt, shapes, step, old, new)
+        return jax.tree.map(jnp.add, own, more)
 
-    kinetic, elastic = jax.lax.map(measure, states)
+    levels = (states, None if drive is None else drive.moves)
+    kinetic, elastic = jax.lax.map(lambda level: measure(*level), levels)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
-    change, work, viscous, losses = jax.lax.map(lambda step: flow(*step), (old, new, control))
-    numerical = jnp.asarray(losses.numerical, change.dtype)
+    steps = (old, new, control, None if drive is None else every_step(drive))
+    flows = jax.lax.map(lambda step: flow(*step), steps)
     return Energy(
         kinetic=kinetic,
         elastic=elastic,
-        change=change,
-        work=work,
-        viscous_loss=viscous,
-        impact_loss=losses.impact,
-        numerical_loss=numerical,
-        residual=change - (work - (viscous + losses.impact + numerical)),
+        change=flows.change,
+        work=flows.work,
+        viscous_loss=flows.viscous,
+        impact_loss=flows.impact,
+        numerical_loss=flows.numerical,
+        residual=flows.change - (flows.work - (flows.viscous + flows.impact + flows.numerical)),
     )

@@ -150,6 +150,9 @@ def _solve_held(
     closed = _solve(constant[0], problem, constant[0].load)[1].multiplier > 0.0
 
     rows = jnp.where(closed[:, None], jax.vmap(lambda x: system.normals @ x, 1, 1)(rigid), 0.0)
+    if system.rollers is not None:
+        rollers = system.rollers
+        rows = jnp.concatenate([rows, jax.vmap(lambda x: rollers @ x, 1, 1)(rigid)])
     n_held = jnp.sum(jnp.linalg.svd(rows, compute_uv=False) > HELD)
     _check_held(n_held, rigid.shape[1])
     weights, nodes = system.normals.weights, np.asarray(system.contact_nodes)

@@ -22,6 +22,7 @@ for moving the mass to the neighbours.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import ModuleType
 
 import jax
@@ -38,6 +39,7 @@ from jaxcontact.system.block_matrix import (
     scatter,
 )
 from jaxcontact.system.bodies import body_numbers
+from jaxcontact.system.sparse import ContactNormals
 from jaxcontact.system.system import System
 
 #: How dear a tangential offset of a donor is, against a distant donor.
@@ -61,10 +63,19 @@ def redistribute(system: System) -> BlockMatrix:
     return corrected
 
 
+def massless_rows(system: System) -> ContactNormals:
+    """Return the directions without mass: N, with unit rows where rollers have shortened them."""
+    rows = system.normals
+    if system.rollers is None:
+        return rows
+    lengths = jnp.linalg.norm(rows.weights, axis=1, keepdims=True)
+    return replace(rows, weights=rows.weights / lengths)
+
+
 def tangential_projection(system: System) -> BlockMatrix:
     """Return I - Q with Q = N^T N."""
     n_nodes, d = len(system.free_nodes), system.dimension
-    normals = on_host(system.normals.weights)
+    normals = on_host(massless_rows(system).weights)
     pairs = np.asarray(system.node_numbers)[np.asarray(system.contact_nodes)]
     outer = normals[:, :, None] * normals[:, None, :]
     identity = np.tile(np.eye(d, dtype=system.dtype), (n_nodes, 1, 1))
@@ -76,7 +87,7 @@ def _inward_shift(system: System) -> BlockMatrix:
     """Return E."""
     number = np.asarray(system.node_numbers)
     contact_nodes = np.asarray(system.contact_nodes)
-    points, normals = on_host(system.points), on_host(system.normals.weights)
+    points, normals = on_host(system.points), on_host(massless_rows(system).weights)
     pairs, donors, size = _donors(system)
     offsets = points[donors] - points[contact_nodes[pairs]]  # (z, d)
     # Donors of one contact node are a row of the table; missing ones have no weight.

@@ -12,7 +12,8 @@ The rows of K times tau/4 make this one symmetric problem with the SPD matrix
 
     D = M_r + tau^2/4 A + tau/4 (B + (I - Q) B (I - Q)),   Q = N^T N,
 
-since A and B, not the mass, hold the contact nodes.
+since A and B, not the mass, hold the contact nodes. Rollers shorten the rows of N; in Q they are
+unit vectors.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
-from jaxcontact.schemes.mass_redistribution import redistribute, tangential_projection
+from jaxcontact.schemes.mass_redistribution import (
+    massless_rows,
+    redistribute,
+    tangential_projection,
+)
 from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.block_matrix import from_symmetric
 from jaxcontact.system.system import System
@@ -92,6 +97,10 @@ class RedistributedMass:
         velocity = w + _remove_normal(system, w - v)
         return StepResult(y + dt * w, velocity, 4.0 * solution.multiplier, (solution,))
 
+    def force_of_step(self, system: System, old: Array, new: Array, inertia: Array) -> Array:
+        """Return the force at the middle, on massless rows that at the end; see `OwnForces`."""
+        return new + _remove_normal(system, inertia - 0.5 * (new - old))
+
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
@@ -108,4 +117,5 @@ class RedistributedMass:
 
 def _remove_normal(system: System, x: Array) -> Array:
     """Return (I - Q) x, (n,)."""
-    return x - system.normals.transposed_product(system.normals @ x, system.size)
+    rows = massless_rows(system)
+    return x - rows.transposed_product(rows @ x, system.size)

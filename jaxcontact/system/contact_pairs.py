@@ -54,6 +54,12 @@ class ContactPairs(NamedTuple):
     shares: Array | np.ndarray
     """Share of each of them in what the pair is measured from, (C, m); zero for none."""
 
+    held: Array | np.ndarray
+    """Share of the nodes of each clamped set, (C, S); see `clamped_numbers`."""
+
+    members: np.ndarray
+    """Whether a pair stands for one of each contact set, in the order of their names, (C, K)."""
+
     @property
     def row_nodes(self) -> np.ndarray:
         """Nodes of the rows of N, the node of the pair first, (C, 1+m) int32."""
@@ -68,35 +74,45 @@ class ContactPairs(NamedTuple):
 
 
 def contact_pairs(
-    scene: Scene, points: Array | np.ndarray, is_free: np.ndarray, dtype: np.dtype
+    scene: Scene, points: Array | np.ndarray, clamped_set: np.ndarray, dtype: np.dtype
 ) -> ContactPairs:
     """Return the contact pairs, in the digits of the node positions.
 
     Args:
         scene: the scene.
         points: node positions, (N, d) [m].
-        is_free: nodes that are not clamped, (N,) bool.
+        clamped_set: number of the clamped set of each node, (N,) int, -1 for a free one.
         dtype: the type to which the gap will be rounded.
 
     Raises:
         ValueError: if an obstacle defines no surface, or no node of a contact set sees the other
             body, or where that is cannot be searched because all node positions are traced.
     """
-    sets = _merge_sets(scene)
+    sets, n_clamped = _merge_sets(scene), len(scene.clamped)
     if not sets:
         none, no_shares = np.zeros(0), np.zeros((0, 0))
         nodes, masters = none.astype(np.int32), no_shares.astype(np.int32)
-        return ContactPairs(nodes, masters, none, points[:0], none, none, no_shares)
+        held = np.zeros((0, n_clamped))
+        return ContactPairs(
+            nodes, masters, none, points[:0], none, none, no_shares, held, no_shares.astype(bool)
+        )
     parts = [
-        _body_pairs(scene, names, obstacle, facets, points, is_free, dtype)
+        _body_pairs(scene, names, obstacle, facets, points, clamped_set, dtype)
         if isinstance(obstacle, Facets)
-        else _obstacle_pairs(obstacle, facets, points, dtype)
+        else _obstacle_pairs(obstacle, facets, points, n_clamped, dtype)
         for names, obstacle, facets in sets
     ]
+    parts = [
+        part._replace(members=_members(scene, names, part.nodes))
+        for part, (names, *_) in zip(parts, sets, strict=True)
+    ]
     width = max(part.masters.shape[1] for part in parts)
-    nodes, masters, *values = zip(*(_widened(part, width) for part in parts), strict=True)
+    nodes, masters, *values, members = zip(*(_widened(part, width) for part in parts), strict=True)
     pairs = ContactPairs(
-        np.concatenate(nodes), np.concatenate(masters), *(concatenate(*value) for value in values)
+        np.concatenate(nodes),
+        np.concatenate(masters),
+        *(concatenate(*value) for value in values),
+        members=np.concatenate(members),
     )
     if is_traced((pairs.gap, pairs.normals)):
         return pairs
@@ -105,7 +121,11 @@ def contact_pairs(
 
 
 def _obstacle_pairs(
-    obstacle: Obstacle, facets: np.ndarray, points: Array | np.ndarray, dtype: np.dtype
+    obstacle: Obstacle,
+    facets: np.ndarray,
+    points: Array | np.ndarray,
+    n_clamped: int,
+    dtype: np.dtype,
 ) -> ContactPairs:
     """Return the pairs of facets (F, d) that may touch a rigid obstacle."""
     nodes = np.unique(facets).astype(np.int32)
@@ -113,8 +133,9 @@ def _obstacle_pairs(
     gap, normals = gap_and_normals(obstacle, places)
     area = _areas(points, facets, nodes)
     rounding = _rounding(gap, normals, position_sizes(obstacle, places), dtype)
-    none = np.zeros((nodes.size, 0))
-    return ContactPairs(nodes, none.astype(np.int32), gap, normals, area, rounding, none)
+    none, held = np.zeros((nodes.size, 0)), np.zeros((nodes.size, n_clamped))
+    masters, members = none.astype(np.int32), none.astype(bool)
+    return ContactPairs(nodes, masters, gap, normals, area, rounding, none, held, members)
 
 
 def _body_pairs(
@@ -123,17 +144,26 @@ def _body_pairs(
     other: Facets,
     facets: np.ndarray,
     points: Array | np.ndarray,
-    is_free: np.ndarray,
+    clamped_set: np.ndarray,
     dtype: np.dtype,
 ) -> ContactPairs:
     """Return the pairs of facets (F, d) of the named contact sets that may touch another body."""
-    meeting = find_meeting(names, facets, other, scene.mesh, is_free)
+    meeting = find_meeting(names, facets, other, scene.mesh, clamped_set)
     rows = mortar_rows(points, facets, end_signs(scene.mesh), direction_of(other), meeting)
     places = jnp.asarray(points[meeting.nodes])
     both = jnp.max(2.0 * jnp.abs(places) + jnp.abs(rows.gap)[:, None], axis=0)
     rounding = _rounding(rows.gap, rows.normals, both, dtype)
-    nodes, masters = meeting.nodes, meeting.masters
-    return ContactPairs(nodes, masters, rows.gap, rows.normals, rows.area, rounding, rows.shares)
+    nodes, masters, members = meeting.nodes, meeting.masters, np.zeros((len(rounding), 0), bool)
+    values = (rows.gap, rows.normals, rows.area, rounding, rows.shares, rows.held)
+    return ContactPairs(nodes, masters, *values, members)
+
+
+def _members(scene: Scene, names: list[str], nodes: np.ndarray) -> np.ndarray:
+    """Return whether pairs of the named sets at the nodes belong to each contact set, (C, K)."""
+    belongs = [
+        np.isin(nodes, scene.mesh.facets[name]) & (name in names) for name in sorted(scene.contact)
+    ]
+    return np.stack(belongs, axis=1)
 
 
 def _widened(pairs: ContactPairs, width: int) -> ContactPairs:
@@ -193,6 +223,7 @@ def _drop_twins(
     Its area is that of the node in the union of their sets.
     """
     gap, normals, area = np.asarray(pairs.gap), np.asarray(pairs.normals), np.array(pairs.area)
+    members = np.array(pairs.members)
     tolerance = ROUNDING * np.finfo(normals.dtype).eps
     nodes, counts = np.unique(pairs.nodes, return_counts=True)
     shared = np.flatnonzero(np.isin(pairs.nodes, nodes[counts > 1]))
@@ -218,8 +249,10 @@ def _drop_twins(
                     union = np.unique(np.concatenate([facets[k] for k in joined]), axis=0)
                     areas[joined] = np.asarray(nodal_areas(points, union))
                 area[kept] = areas[joined][node]
-    values = (gap, normals, area, np.asarray(pairs.rounding), np.asarray(pairs.shares))
-    return ContactPairs(pairs.nodes[keep], pairs.masters[keep], *(x[keep] for x in values))
+                members[kept] = np.any(members[[kept, *dropped]], axis=0)
+    rest = (pairs.rounding, pairs.shares, pairs.held, members)
+    values = (np.asarray(x)[keep] for x in (gap, normals, area, *rest))
+    return ContactPairs(pairs.nodes[keep], pairs.masters[keep], *values)
 
 
 def _dense_rows(pairs: ContactPairs, chosen: np.ndarray) -> dict[int, np.ndarray]:

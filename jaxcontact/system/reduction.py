@@ -39,11 +39,15 @@ def reduce(system: System, modes: int, *, contact_responses: bool = True) -> Sys
         displacements and controls keep their shapes.
 
     Raises:
-        ValueError: if the system is traced or reduced already, or `modes` does not lie between 1
-            and n - 1.
+        ValueError: if the system is traced, reduced already or has rollers, or `modes` does not lie
+            between 1 and n - 1.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
+    if system.rollers is not None:
+        raise ValueError(
+            "a system with rollers is not reduced; clamp the facet set, or use the full system"
+        )
     if isinstance(system.stiffness.values, Tracer):
         raise ValueError(
             "reduce needs concrete matrices, since it computes eigenvectors on the host; call it "

@@ -15,9 +15,17 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
+from jaxcontact.scene.scene import (
+    Scene,
+    cellwise_material,
+    check_scene,
+    clamped_numbers,
+    is_elastic,
+)
 from jaxcontact.system import assembly
 from jaxcontact.system.contact_pairs import contact_pairs
+from jaxcontact.system.parts import Parts, named_parts
+from jaxcontact.system.rollers import check_movable, hold_rows, roller_rows
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import as_array
@@ -57,7 +65,7 @@ class System:
 
     normals: ContactNormals
     """N, contact operator, (C, n); rows point from the body to the obstacle, or to the other body,
-    whose displacement they subtract."""
+    whose displacement they subtract. With rollers N P: they leave out what is held."""
 
     gap: Array
     """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
@@ -84,8 +92,17 @@ class System:
     node_numbers: np.ndarray
     """Position of each node among the free ones, (N,) int32; n/d for a clamped node."""
 
+    directions: Array
+    """Unit vector nu of each contact pair towards the obstacle or the other body, (C, d)."""
+
+    parts: Parts
+    """The facet sets, obstacles and clamped sets by name, for what changes in time."""
+
     dimension: int = field(metadata={"static": True})
     """Space dimension d."""
+
+    rollers: ContactNormals | None = None
+    """Orthonormal directions in which nodes are held by rollers, (H, n); None without rollers."""
 
     basis: Basis | None = None
     """Space of a reduced model (see `reduce`); None is all displacement components."""
@@ -145,7 +162,12 @@ class System:
     @in_full_precision
     def control_load(self, control: Array) -> Array:
         """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
-        load = _free_components(self, self.nodal_mass @ control)
+        return self.nodal_load(self.nodal_mass @ control)
+
+    @in_full_precision
+    def nodal_load(self, forces: Array) -> Array:
+        """Return the load (..., n) [N] of forces on the nodes (..., N, d) [N]."""
+        load = _free_components(self, forces)
         return load if self.basis is None else load @ self.basis.vectors
 
 
@@ -175,8 +197,8 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     points = jnp.asarray(mesh.points, dtype)
     cells = np.asarray(mesh.cells)
 
-    is_free = np.ones(mesh.n_nodes, bool)
-    is_free[clamped_nodes(scene)] = False
+    clamped_set = clamped_numbers(scene)
+    is_free = clamped_set < 0
     free_nodes = np.flatnonzero(is_free).astype(np.int32)
     if free_nodes.size == 0:
         raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
@@ -184,6 +206,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
 
     pattern = assembly.node_pattern(cells, numbers)
     all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
+    around = {name: assembly.neighbourhood(cells, mesh.facets[name]) for name in scene.clamped}
     values = assembly.scene_values(
         points,
         cells,
@@ -193,16 +216,23 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         free_nodes,
         None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
         {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
+        around,
         is_elastic=is_elastic(scene),
     )
     # Under jit too, what is concrete stays so and can be checked and compared.
     with jax.ensure_compile_time_eval():
         # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, as_array(mesh.points), is_free, dtype)
+        pairs = contact_pairs(scene, as_array(mesh.points), clamped_set, dtype)
         weights = jnp.asarray(pairs.row_weights(), dtype)
+        rollers = roller_rows(scene, as_array(mesh.points), numbers, dtype)
     components = np.arange(dimension, dtype=np.int32)
     rows = numbers[pairs.row_nodes].astype(np.int32)[:, :, None]
     unknowns = (rows * dimension + components[None, None, :]).reshape(weights.shape)
+
+    normals = ContactNormals(weights, unknowns, dimension * free_nodes.size)
+    if rollers is not None:
+        normals = hold_rows(rollers, normals)
+        check_movable(scene, normals, pairs.nodes)
 
     def on_free(values: Array) -> SymmetricMatrix:
         return SymmetricMatrix(values, pattern.columns)
@@ -213,7 +243,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
         l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
         nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(weights, unknowns, dimension * free_nodes.size),
+        normals=normals,
         gap=jnp.asarray(pairs.gap, dtype),
         gap_rounding=jnp.asarray(pairs.rounding, dtype),
         load=values.load,
@@ -222,7 +252,10 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         points=points,
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
+        directions=jnp.asarray(pairs.normals, dtype),
+        parts=named_parts(scene, pairs, around, values.clamped, dtype),
         dimension=dimension,
+        rollers=rollers,
     )
 
 

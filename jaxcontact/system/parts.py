@@ -1,0 +1,92 @@
+"""The named parts of a scene, so that loads, obstacles and supports can change in time by name.
+
+Small arrays only: what belongs to one facet set, or to the nodes around it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxcontact.scene.facets import Facets
+from jaxcontact.scene.scene import Scene
+from jaxcontact.system.assembly import Neighbourhood, SetForces
+from jaxcontact.system.contact_pairs import ContactPairs
+from jaxcontact.system.pairing import end_signs
+
+
+class ClampedSet(NamedTuple):
+    """A clamped facet set: what the rest of the scene feels when it moves as a whole."""
+
+    nodes: np.ndarray
+    """Nodes of the set, (k,) int32."""
+
+    around: np.ndarray
+    """All nodes of the cells that touch the set, (m,) int32."""
+
+    forces: SetForces
+    """Forces on these nodes."""
+
+    is_alone: np.ndarray
+    """Whether no node is in another clamped set too, () bool; else it cannot move by itself."""
+
+    shares: Array
+    """Share of the set in what each contact pair is measured from, (C,); zero without `Facets`."""
+
+
+class Parts(NamedTuple):
+    """The named parts of a scene with C contact pairs."""
+
+    facets: dict[str, np.ndarray]
+    """Nodes of the facets of each set of the mesh, (F, d) int32, oriented outward."""
+
+    ends: np.ndarray
+    """1 at right and -1 at left ends of bodies in one dimension, (N,); (0,) in more."""
+
+    obstacles: dict[str, np.ndarray]
+    """Which pairs move with the rigid obstacle of each contact set, (C,): 1, and 0 for the others;
+    2 or more for a pair that stands for several sets: with which of them it moves is not known."""
+
+    clamped: dict[str, ClampedSet]
+    """The clamped sets."""
+
+
+def named_parts(
+    scene: Scene,
+    pairs: ContactPairs,
+    around: dict[str, Neighbourhood],
+    forces: dict[str, SetForces],
+    dtype: np.dtype,
+) -> Parts:
+    """Return the named parts of a scene.
+
+    Args:
+        scene: the scene.
+        pairs: its contact pairs.
+        around: the cells around each clamped set.
+        forces: on the nodes of these cells.
+        dtype: type of the values.
+    """
+    mesh = scene.mesh
+    n_sets = np.count_nonzero(pairs.members, axis=1)
+    obstacles = {
+        name: np.where(pairs.members[:, column], n_sets, 0).astype(dtype)
+        for column, name in enumerate(sorted(scene.contact))
+        if not isinstance(scene.contact[name], Facets)
+    }
+    sets = {name: np.unique(mesh.facets[name]).astype(np.int32) for name in scene.clamped}
+    clamped = {}
+    for number, name in enumerate(scene.clamped):
+        others = [nodes for other, nodes in sets.items() if other != name]
+        shared = np.intersect1d(sets[name], np.concatenate(others)) if others else np.zeros(0)
+        clamped[name] = ClampedSet(
+            nodes=sets[name],
+            around=around[name].nodes,
+            forces=forces[name],
+            is_alone=np.asarray(shared.size == 0),
+            shares=jnp.asarray(pairs.held[:, number], dtype),
+        )
+    return Parts(dict(mesh.facets), end_signs(mesh), obstacles, clamped)
