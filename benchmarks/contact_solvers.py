@@ -47,11 +47,11 @@ def solve_all(solver: ContactSolver, is_warm: bool):
 
     def run(compliance: Array, offset: Array):
         resolution = jnp.zeros_like(offset[0])
-        first = Guess(jnp.zeros(offset.shape[1], bool), solver.first_memory(compliance))
+        first = Guess(jnp.zeros(offset.shape[1], bool), solver.first_workspace(compliance))
 
         def step(guess: Guess, q: Array):
             solution = solver.solve(compliance, q, resolution, guess)
-            return (solution.guess if is_warm else guess), solution._replace(memory=())
+            return (solution.guess if is_warm else guess), solution._replace(workspace=())
 
         return jax.lax.scan(step, first, offset)[1]
 

@@ -44,6 +44,7 @@ from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
 from jaxcontact.motion.step import step
 from jaxcontact.motion.stepper import Stepper, prepare, with_contact
+from jaxcontact.motion.stress import Stress, stress
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.optimize import (
     LBFGS,
@@ -134,6 +135,7 @@ __all__ = [
     "Status",
     "SteepestDescent",
     "Stepper",
+    "Stress",
     "Strong",
     "System",
     "TrackingCost",
@@ -173,6 +175,7 @@ __all__ = [
     "solve_static",
     "stationarity",
     "step",
+    "stress",
     "with_contact",
 ]
 

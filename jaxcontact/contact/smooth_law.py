@@ -37,6 +37,9 @@ MAX_HALVINGS = 12
 #: Newton steps without progress before rounding is taken to have ended the descent.
 PATIENCE = 4
 
+#: Rounding errors of the residual that a solution may have.
+ROUNDINGS = 64.0
+
 
 class PairState(NamedTuple):
     """Where the pairs are on the curve of their law, each (C,)."""
@@ -109,6 +112,7 @@ def solve(
     """
     diagonal = jnp.diagonal(compliance)
     scale = jnp.sqrt(diagonal)
+    tolerance = complementarity.tolerance(offset, resolution)
 
     def residual(x: Array) -> Array:
         pair = law(x)
@@ -123,6 +127,9 @@ def solve(
     def merit(x: Array, error: Array) -> Array:
         # Rounding of a pair far from contact must not hide the descent of the others.
         return jnp.linalg.norm(jnp.maximum(jnp.abs(error) - noise(x), 0.0) / scale)
+
+    def is_solution(error: Array, rounding: Array) -> Array:
+        return jnp.all(jnp.abs(error) <= ROUNDINGS * rounding + tolerance)
 
     def is_unfinished(descent: _Descent) -> Array:
         is_open = jnp.any(jnp.abs(descent.error) > descent.goal)
@@ -166,8 +173,11 @@ def solve(
         t, new_error = jax.lax.while_loop(is_too_long, shorten, full)
         x = x + t * direction
         size = merit(x, new_error)
-        # Rounding ends the descent: a few steps without progress are enough.
-        patience = jnp.where(size < 0.95 * descent.best, PATIENCE, descent.patience - 1)
+        # Rounding ends the descent: a few steps without progress are enough. Far from it a long way
+        # of short steps, to the curve of pairs that lean on each other, is progress too.
+        is_short = (size <= (1.0 - 0.1 * t) * old_size) & ~is_solution(new_error, noise(x))
+        is_progress = (size < 0.95 * descent.best) | is_short
+        patience = jnp.where(is_progress, PATIENCE, descent.patience - 1)
         best = jnp.minimum(descent.best, size)
         return _Descent(x, new_error, noise(x), best, descent.steps + 1, patience)
 
@@ -177,7 +187,7 @@ def solve(
     error = residual(x)
     start = _Descent(x, error, noise(x), merit(x, error), jnp.int32(0), jnp.int32(PATIENCE))
     x, error, goal, _, steps, _ = jax.lax.while_loop(is_unfinished, advance, start)
-    goal = 64.0 * goal + complementarity.tolerance(offset, resolution)
+    goal = ROUNDINGS * goal + tolerance
     solution = _finish(law(x).multiplier, x, error, goal, steps)
     return solution._replace(workspace=solution.multiplier)
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
@@ -24,6 +23,7 @@ from jaxcontact.derivative.phase import phase_dependence, phase_words
 from jaxcontact.derivative.verdict import Verdict, verdict_of_orders
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.trees import Tree
 
 #: A remainder below this many rounding errors of J is noise; long sums lose a few digits.
 NOISE = 64.0
@@ -133,15 +133,15 @@ class GradientCheck:
 @in_full_precision
 @np.errstate(invalid="ignore", over="ignore")  # a NaN is a finding, not a warning
 def check_gradient(
-    objective: Callable[[Any], Array],
-    u: Any,
+    objective: Callable[[Tree], Array],
+    u: Tree,
     *,
-    gradient: Any = None,
+    gradient: Tree | None = None,
     directions: int = 2,
     step: float = 1e-3,
     n_steps: int = 10,
     seed: int = 0,
-    trajectory: Callable[[Any], Trajectory] | None = None,
+    trajectory: Callable[[Tree], Trajectory] | None = None,
 ) -> GradientCheck:
     """Check the gradient of an objective along itself and along random directions.
 

@@ -40,7 +40,7 @@ ADVICE = (
 class PhaseMean:
     """The mean of an objective over one period of the phase of the touch; see `phase_mean`."""
 
-    objective: Callable[[Any], Array]
+    objective: Callable[..., Array]
     """The objective, which holds a stepper."""
 
     speed: Array
@@ -56,7 +56,7 @@ class PhaseMean:
 
 
 def phase_mean(
-    objective: Callable[[Any], Array],
+    objective: Callable[..., Array],
     speed: float | Array | None = None,
     *,
     phases: int = PHASES,
@@ -89,7 +89,7 @@ def phase_mean(
     return PhaseMean(objective, closing_speed(steppers[0], None, speed), phases)
 
 
-def phase_spread(gradient: Callable[[Array], Any], speed: float | Array) -> Array:
+def phase_spread(gradient: Callable[[Array], object], speed: float | Array) -> Array:
     """Return the standard deviation of a gradient over one period of the phase, over its mean.
 
     Args:
@@ -114,7 +114,7 @@ def phase_spread(gradient: Callable[[Array], Any], speed: float | Array) -> Arra
 
 
 def phase_dependence(
-    objective: Callable[[Any], Array], u: Any, motion: Trajectory | None
+    objective: Callable[[Tree], Array], u: Tree, motion: Trajectory | None
 ) -> tuple[float | None, float | None]:
     """Return closing speed and `phase_spread` of the gradient of an objective.
 
@@ -139,7 +139,7 @@ def phase_dependence(
 
 
 @jax.jit
-def _spread_of_gradient(objective: Callable[[Any], Array], u: Any, speed: float) -> Array:
+def _spread_of_gradient(objective: Callable[[Tree], Array], u: Tree, speed: float) -> Array:
     return phase_spread(lambda x: jax.grad(lambda v: moved(objective, x)(v))(u), speed)
 
 

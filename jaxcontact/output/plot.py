@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike
 from jaxcontact.control.inner_product import nodal_norms
 from jaxcontact.motion.energy import Energy
 from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.output.animation import animate
 from jaxcontact.output.axes import add_grid, import_matplotlib, label_plane, make_axes, scale_axis
+from jaxcontact.output.body import plot_body
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
 
@@ -25,7 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "animate",
     "plot_active_set",
+    "plot_body",
     "plot_contact_force",
     "plot_control",
     "plot_distance",

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +42,7 @@ def lasting_jvp(function: Callable, rule: Callable) -> Callable:
     # differentiated; under jit the function is not traced anew each time.
     function, rule = jax.jit(in_full_precision(function)), in_full_precision(rule)
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: object) -> object:
         leaves, tree = jax.tree.flatten(arguments)
         result_tree = jax.tree.structure(jax.eval_shape(function, *arguments))
         results = _lasting.bind(*leaves, function=function, rule=rule, tree=tree, axes=())
@@ -70,7 +69,7 @@ def _evaluate(
     return _mapped(lambda *x: _flat(x, function, tree), axes)(*leaves)
 
 
-def _abstract(*leaves: Any, **options: Any) -> list:
+def _abstract(*leaves: ShapedArray, **options: object) -> list:
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     results = jax.eval_shape(partial(_evaluate, **options), *shapes)
     return [ShapedArray(x.shape, x.dtype) for x in results]

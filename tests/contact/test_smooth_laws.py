@@ -120,6 +120,25 @@ def distance_from_exact(law, share):
 
 
 @both_laws
+@pytest.mark.parametrize("seed", range(10))
+def test_smooth_contact_is_solved_where_pairs_lean_on_each_other(law, seed):
+    # Every pair twice, up to rounding, and pressed 1e4 times harder than the law is wide.
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(4, 4))
+    twice = np.repeat(root @ root.T + 0.1 * np.eye(4), 2, axis=0)
+    twice = np.repeat(twice, 2, axis=1) * (1.0 + 1e-9 * np.eye(8))
+    offset = -1.0 - np.repeat(rng.random(4), 2) + 1e-4 * rng.random(8)
+    size = (1e-4 if law is jc.SmoothedContact else 1e-8) * size_of(law, twice, offset)
+    solution = solve(law, size, twice, offset, np.zeros(8, bool))
+    p = np.asarray(solution.multiplier)
+    assert solution.status == jc.Status.CONVERGED
+    # The forces of others may be too small for a number.
+    is_felt = p > 0.0
+    g = separation_by_law(law, size, np.diagonal(twice)[is_felt], p[is_felt])
+    np.testing.assert_allclose((twice @ p + offset)[is_felt], g, atol=1e-9)
+
+
+@both_laws
 def test_smooth_contact_without_enough_steps_ends_as_not_converged(law):
     compliance, offset = random_problem(3, 3.0)
     data = (jnp.asarray(compliance), jnp.asarray(offset), jnp.zeros(N_PAIRS, bool))
