@@ -4,8 +4,8 @@ With E = 1/2 v.Mv + 1/2 y.Ay, each step of a scheme satisfies an identity
 
     E' - E = work - viscous loss - impact loss - numerical loss        (to rounding)
 
-with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2; for supports and
-obstacles that move `motion/drive.py`.
+with the scheme's own terms; `residual` is what is missing. What supports and obstacles that move
+add to it is in `drive.py` and `supports.py`. Source: MATH.md 2.
 """
 
 from __future__ import annotations
