@@ -37,6 +37,7 @@ from jaxcontact.derivative import (
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
+from jaxcontact.motion.linearization import linearization_error, turned_gap
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
 from jaxcontact.motion.pressure import contact_pressure
 from jaxcontact.motion.schedule import Schedule, sample
@@ -67,6 +68,7 @@ from jaxcontact.optimize import (
     stationarity,
 )
 from jaxcontact.scene import meshes
+from jaxcontact.scene.compound import Along, Union
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.io import read_mesh
 from jaxcontact.scene.join import join
@@ -91,6 +93,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LBFGS",
     "Actuator",
+    "Along",
     "AlongDirection",
     "BackwardEuler",
     "Ball",
@@ -141,6 +144,7 @@ __all__ = [
     "TrackingCost",
     "Trajectory",
     "Trapezoidal",
+    "Union",
     "Verdict",
     "WeakWolfe",
     "actuator",
@@ -160,6 +164,7 @@ __all__ = [
     "export",
     "join",
     "l2_value_and_grad",
+    "linearization_error",
     "load_result",
     "meshes",
     "optimize",
@@ -176,6 +181,7 @@ __all__ = [
     "stationarity",
     "step",
     "stress",
+    "turned_gap",
     "with_contact",
 ]
 

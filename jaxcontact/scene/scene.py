@@ -35,9 +35,9 @@ class Scene:
     clamped: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the facet sets that are held at zero displacement."""
 
-    contact: Mapping[str, Obstacle | Facets] = field(default_factory=dict)
-    """Facet sets that may touch, with the obstacle that each may touch: a rigid one, or `Facets` of
-    another body."""
+    contact: Mapping[str, Obstacle | tuple[Obstacle, ...] | Facets] = field(default_factory=dict)
+    """Facet sets that may touch, with the obstacle that each may touch: a rigid one, a tuple of
+    rigid ones that each node may touch all, or `Facets` of another body."""
 
     traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
     """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
@@ -75,10 +75,13 @@ def check_scene(scene: Scene) -> None:
                 f"{shared.size} nodes, first {shared[:5].tolist()}; a clamped node cannot be in "
                 "contact: leave a row of facets between the two sets"
             )
+        if obstacle == ():
+            raise ValueError(f"contact[{name!r}] is an empty tuple; give it an obstacle")
         if isinstance(obstacle, Facets):
             check_facets(name, obstacle, mesh)
-        else:
-            check_obstacle(obstacle, mesh.dimension)
+            continue
+        for rigid in obstacle if isinstance(obstacle, tuple) else (obstacle,):
+            check_obstacle(rigid, mesh.dimension)
     check_each_interface_once(scene.contact, mesh)
     vectors = {f"traction[{name!r}]": vector for name, vector in scene.traction.items()}
     if scene.body_force is not None:
@@ -94,6 +97,15 @@ def check_scene(scene: Scene) -> None:
                 f"rollers[{name!r}] must not be the zero vector; None takes the normals of the set"
             )
     _check_materials(scene)
+
+
+def contact_obstacles(scene: Scene) -> list[tuple[str, Obstacle | Facets]]:
+    """Return every obstacle with the name of its contact set, in the order of the names."""
+    return [
+        (name, obstacle)
+        for name, value in sorted(scene.contact.items())
+        for obstacle in (value if isinstance(value, tuple) else (value,))
+    ]
 
 
 def clamped_nodes(scene: Scene) -> np.ndarray:

@@ -14,8 +14,8 @@ from jax import Array
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import Neighbourhood, SetForces
-from jaxcontact.system.contact_pairs import ContactPairs
 from jaxcontact.system.pairing import end_signs
+from jaxcontact.system.pairs import ContactPairs
 
 
 class ClampedSet(NamedTuple):
