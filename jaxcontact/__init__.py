@@ -75,6 +75,7 @@ from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
+from jaxcontact.scene.quality import MeshQuality
 from jaxcontact.scene.scene import Scene
 from jaxcontact.schemes import (
     BackwardEuler,
@@ -83,8 +84,10 @@ from jaxcontact.schemes import (
     RedistributedMass,
     Trapezoidal,
 )
+from jaxcontact.system.discretize import discretize
+from jaxcontact.system.files import load_system
 from jaxcontact.system.reduction import reduce
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.system import System
 from jaxcontact.transforms.time_loop import Checkpoint
 
 if TYPE_CHECKING:
@@ -117,6 +120,7 @@ __all__ = [
     "KelvinVoigt",
     "MemoryEstimate",
     "Mesh",
+    "MeshQuality",
     "NestedDissection",
     "NewtonCG",
     "OpenBranch",
@@ -166,6 +170,7 @@ __all__ = [
     "l2_value_and_grad",
     "linearization_error",
     "load_result",
+    "load_system",
     "meshes",
     "optimize",
     "phase_mean",

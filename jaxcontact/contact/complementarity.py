@@ -30,6 +30,8 @@ class Status(IntEnum):
     """Converged, but by the safeguard of the chosen method."""
     NOT_CONVERGED = 2
     NON_FINITE = 3
+    PENETRATES = 4
+    """A pair that is taken to stay open (`System.with_pairs`) would penetrate."""
 
 
 class Guess(NamedTuple):

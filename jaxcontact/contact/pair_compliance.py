@@ -44,22 +44,21 @@ def _compliance_jvp(arguments, tangents):
     matrix, normals, factor = arguments
     values_dot, weights_dot = tangents[0].values, tangents[1].weights
 
-    def one(row: tuple[Array, ...]) -> Array:
-        weights, unknowns, *changes = row
-        normal = jnp.zeros(matrix.size, weights.dtype).at[unknowns].add(weights)
+    def one(row: tuple[ContactNormals, Array | None]) -> Array:
+        pair, change = jax.tree.map(lambda x: x[None], row)
+        normal = pair.transposed_product(jnp.ones(1, pair.weights.dtype), matrix.size)
         z = jax.lax.custom_linear_solve(
             lambda x: matrix @ x, normal, lambda _, r: factor.solve(r), symmetric=True
         )
         rate = jnp.zeros((), z.dtype)
-        if changes:
-            rate = 2.0 * jnp.dot(changes[0], z[unknowns])
+        if change is not None:
+            rate = 2.0 * jnp.sum(change * pair.touched(z))
         if not isinstance(values_dot, SymbolicZero):
             rate = rate - jnp.dot(z, SymmetricMatrix(values_dot, matrix.columns) @ z)
         return rate
 
-    rows = (normals.weights, normals.unknowns)
-    rows = rows if isinstance(weights_dot, SymbolicZero) else (*rows, weights_dot)
-    return _diagonal(*arguments), jax.lax.map(one, rows)
+    changes = None if isinstance(weights_dot, SymbolicZero) else weights_dot
+    return _diagonal(*arguments), jax.lax.map(one, (normals, changes))
 
 
 _diagonal = lasting_jvp(_compliance, _compliance_jvp)

@@ -26,8 +26,8 @@ class Fixed(NamedTuple):
     columns: Array | np.ndarray | None
     """Sparsity of D, (width, n) int32; None is dense."""
 
-    unknowns: Array | np.ndarray
-    """Sparsity of N, (C, k) int32."""
+    unknowns: Array | np.ndarray | None
+    """Sparsity of N, (C, k) int32; None is dense."""
 
     form: ContactForm
     """Factor and contact solver. The derivative by D enters through the values of the matrix

@@ -141,6 +141,6 @@ def _courant_number(stepper: PreparedScene) -> Array:
     """
     system, normals = stepper.system, stepper.system.normals
     squares = normals.weights**2
-    stiffness = jnp.sum(squares * system.stiffness.diagonal()[normals.unknowns], axis=1)
-    mass = jnp.sum(squares * system.mass.diagonal()[normals.unknowns], axis=1)
+    stiffness = jnp.sum(squares * normals.touched(system.stiffness.diagonal()), axis=1)
+    mass = jnp.sum(squares * normals.touched(system.mass.diagonal()), axis=1)
     return stepper.dt * jnp.sqrt(jnp.max(stiffness / mass, initial=0.0) / 3.0)

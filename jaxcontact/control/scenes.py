@@ -19,7 +19,8 @@ from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.obstacle import HalfSpace
 from jaxcontact.scene.scene import Scene
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.discretize import discretize
+from jaxcontact.system.system import System
 
 RADIUS = 15.0
 #: Half a turn in the plane.

@@ -243,9 +243,12 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if an unknown belongs to two contact pairs, as with two bodies, or if the
-                values are concrete and so ill-conditioned that no solve could succeed.
+            ValueError: if the matrix is dense, an unknown belongs to two contact pairs, as with
+                two bodies, or the values are concrete and so ill-conditioned that no solve could
+                succeed.
         """
+        if matrix.columns is None:
+            raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         unknowns = np.asarray(normals.unknowns)
         if np.unique(unknowns).size != unknowns.size:
             raise ValueError(

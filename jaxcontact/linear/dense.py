@@ -85,6 +85,6 @@ def _invert(matrix: SymmetricMatrix, normals: ContactNormals) -> DenseFactor:
     factor = jax.scipy.linalg.cho_factor(scale[:, None] * dense * scale[None, :], lower=True)
     inverse = jax.scipy.linalg.cho_solve(factor, identity)
     inverse = scale[:, None] * (0.5 * (inverse + inverse.T)) * scale[None, :]
-    response = jnp.sum(normals.weights[:, :, None] * inverse[normals.unknowns], axis=1)
-    compliance = jnp.sum(normals.weights[None] * response[:, normals.unknowns], axis=2)
+    response = jax.vmap(lambda column: normals @ column, 1, 1)(inverse)
+    compliance = jax.vmap(lambda row: normals @ row)(response)
     return DenseFactor(inverse, response, 0.5 * (compliance + compliance.T))

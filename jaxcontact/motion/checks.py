@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,23 @@ from jaxcontact.contact import Status
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.schemes.terms import gap_resolution
+from jaxcontact.system.pair_set import Pairs, PairSet
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced, poison_unless
 
+Tree = TypeVar("Tree")
+
 #: An initial state may reach into an obstacle by so many rounding errors of the gap: a state that
 #: another run ended with does.
 PENETRATION = 64.0
+
+
+#: What to do where `Status.PENETRATES`.
+KEEP_PAIR = (
+    "a pair that is taken to stay open would penetrate; keep it among the pairs of "
+    "system.with_pairs(...) or jc.reduce(..., pairs=...)"
+)
 
 
 class SolveError(RuntimeError):
@@ -140,10 +150,29 @@ def _moved(system: System, values: Array) -> Array:
 
 
 def _penetration(system: System, displacement: Array) -> Array:
-    """Return the depth of each pair in the obstacle, (C,) [m]; zero up to rounding."""
-    y = system.restrict(displacement)
-    gap = system.gap - system.normals @ y
-    return jnp.where(gap < -PENETRATION * gap_resolution(system, y), -gap, 0.0)
+    """Return the depth of each pair in the obstacle, (C,) [m]; zero up to rounding.
+
+    Of the field itself: its projection on the space of a reduced model may penetrate.
+    """
+    pairs = system
+    if system.basis is not None:
+        normals, rest = system.basis.normals, (system.gap_rounding, system.contact_nodes)
+        pairs = PairSet(normals, system.gap, *rest)
+    return depth(pairs, system.free_components(displacement))
+
+
+def depth(pairs: Pairs, y: Array) -> Array:
+    """Return how deep pairs are in their obstacle, (C,) [m], for y (n,); zero up to rounding."""
+    gap = pairs.gap - pairs.normals @ y
+    return jnp.where(gap < -PENETRATION * gap_resolution(pairs, y), -gap, 0.0)
+
+
+def refuse_closed(system: System, y: Array, values: Tree, status: Array) -> tuple[Tree, Array]:
+    """Return values and status of unknowns (n,); NaN where a pair that stays open penetrates."""
+    if system.open_pairs is None:
+        return values, status
+    is_open = jnp.all(jax.lax.stop_gradient(depth(system.open_pairs, y)) <= 0.0)
+    return poison_unless(is_open, values), jnp.where(is_open, status, Status.PENETRATES)
 
 
 def _check_finite(name: str, value: Array) -> None:
@@ -171,6 +200,8 @@ def raise_if_failed(trajectory: Trajectory) -> None:
     if not failed.size:
         return
     step = int(failed[0])
+    if status[step] == Status.PENETRATES:
+        raise SolveError(f"step {step + 1} of {status.size}: {KEEP_PAIR}")
     reason = Status(int(status[step])).name.lower().replace("_", " ")
     details = [f"step {step + 1} of {status.size}"]
     # Under grad the status is concrete, but what can be differentiated is not.

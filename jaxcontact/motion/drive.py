@@ -6,7 +6,7 @@ Loads are amplitudes times shapes. An obstacle that has moved by d(t) leaves the
 
 and so does a clamped set of another body that has moved by g(t), by its share in the row of a pair.
 The wall does the work -lam . (psi' - psi)/tau, and lam . (psi - N y)/tau is lost in the impact.
-Source: MATH.md 10.
+Source: MATH.md 11.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The gap psi - N y is linear in the displacement, with the normals of the reference configuration.
 Against the gap phi(x + y) of the deformed body it is wrong by about u^2 / (2 R) where a node has
 moved by u along a surface of radius R. The error is reported and never corrected.
-Source: MATH.md 10.
+Source: MATH.md 11.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.compound import gap_to
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.scene import Scene, clamped_numbers
 from jaxcontact.system.contact_pairs import contact_pairs, merged_obstacles
 from jaxcontact.system.mortar import directions, meet
-from jaxcontact.system.pairing import direction_of, end_signs, find_meeting
+from jaxcontact.system.pairing import direction_of, find_meeting
 from jaxcontact.system.pairs import ContactPairs
 from jaxcontact.transforms.traced import as_array, is_traced
 
@@ -141,7 +142,7 @@ def _met(
     nodes: np.ndarray,
 ) -> np.ndarray:
     """Return the gaps (C,) of nodes in the configuration x (N, d); NaN where nothing is met."""
-    gaps, ends = np.full(nodes.size, np.nan), end_signs(scene.mesh)
+    gaps, ends = np.full(nodes.size, np.nan), end_signs(scene.mesh.cells)
     mesh = dataclasses.replace(scene.mesh, points=x, layout=x)
     try:
         meeting = find_meeting(names, slave, facets, mesh, clamped_numbers(scene))

@@ -99,6 +99,12 @@ def check_schedule(system: System, schedule: Schedule) -> tuple[Schedule, int]:
             f"the entries of a Schedule must be for one number of steps T, got {steps}; forces "
             "have T rows, one a step, and motions T+1, one a time level"
         )
+    moves = schedule.obstacle or schedule.motion or schedule.gap is not None
+    if system.open_pairs is not None and moves:
+        raise ValueError(
+            "pairs that are taken to stay open, by with_pairs or reduce(pairs=), do not follow "
+            "obstacles and supports that move; keep all pairs"
+        )
     _check_movable(system, schedule)
     return jax.tree.map(lambda x: jnp.asarray(x, system.dtype), schedule), min(steps.values())
 

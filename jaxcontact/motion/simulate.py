@@ -13,7 +13,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
-from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed
+from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed, refuse_closed
 from jaxcontact.motion.drive import (
     StepDrive,
     apply_drive,
@@ -23,6 +23,7 @@ from jaxcontact.motion.drive import (
     shifted,
     show_motion,
 )
+from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
@@ -75,8 +76,9 @@ def simulate(
         ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
             finite, the recorded states are more than twice the memory of all devices, or the
             initial state penetrates an obstacle or moves a clamped node.
-        SolveError: if a step was not solved and the result is concrete; under jit, grad or vmap
-            the trajectory is NaN from that step on instead.
+        SolveError: if a step was not solved, or closes a pair that is taken to stay open, and the
+            result is concrete; under jit, grad or vmap the trajectory is NaN from that step on
+            instead.
 
     Derivative: reverse mode of every order by control, initial state, schedule and every value of
     the stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
@@ -146,17 +148,20 @@ def _run(
 ) -> Trajectory:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
+    drive = shapes = None
+    if schedule is not None:
+        drive, shapes = drive_of(system, dt, schedule)
+    first = system
+    if drive is not None and drive.shift is not None:
+        first = shifted(system, drive.shift[0])
+    assert initial.displacement is not None
     start = first_state(
         stepper.scheme,
         system,
         operators,
-        system.restrict(initial.displacement),
+        first_displacement(first, initial.displacement, weak_contact),
         system.restrict(initial.velocity),
     )
-
-    drive = shapes = None
-    if schedule is not None:
-        drive, shapes = drive_of(system, dt, schedule)
 
     def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation, StepDrive | None]):
         force, perturbation, driven = inputs
@@ -168,9 +173,11 @@ def _run(
             load = load + more
         perturbed = perturbation.on(operators, dt)
         result = stepper.scheme.step(now, perturbed, dt, state, load)
+        iterations, status, residual = _worst(result.solutions)
+        result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
             result.impulse,
-            _worst(result.solutions),
+            (iterations, status, residual),
             _record(dt, result.solutions),
         )
 

@@ -22,7 +22,7 @@ from jax.core import Tracer
 
 from jaxcontact.contact import Bound, ContactProblem, ContactSolver, Solution, Status
 from jaxcontact.linear import LinearSolver
-from jaxcontact.motion.checks import SolveError
+from jaxcontact.motion.checks import KEEP_PAIR, SolveError, refuse_closed
 from jaxcontact.motion.stepper import choose_solvers, factorize
 from jaxcontact.schemes.mass_redistribution import rigid_fields
 from jaxcontact.schemes.terms import gap_resolution
@@ -98,14 +98,15 @@ def solve_static(
         y, solution = _solve(system, problem, system.load)
     else:
         y, solution = _solve_held(system, rigid, *solvers)
-    _check(solution.status)
+    (y, force), status = refuse_closed(system, y, (y, solution.multiplier), solution.status)
+    _check(status)
     return StaticContact(
         displacement=system.lift(y),
-        contact_force=solution.multiplier,
-        contact_pressure=solution.multiplier / system.contact_area,
+        contact_force=force,
+        contact_pressure=force / system.contact_area,
         gap=system.gap - system.normals @ y,
         active=solution.active,
-        status=solution.status,
+        status=status,
     )
 
 
@@ -190,6 +191,8 @@ def _check(status: Array) -> None:
             "the stiffness matrix is not positive definite; is enough clamped that the body cannot "
             "move rigidly, and is no cell inverted or flat?"
         )
+    if int(status) == Status.PENETRATES:
+        raise SolveError(KEEP_PAIR)
     if int(status) == Status.NOT_CONVERGED:
         raise SolveError(
             "static contact was not solved; allow more steps, for instance "

@@ -1,4 +1,4 @@
-"""Abaqus decks: nodes, linear simplices, and the sets and surfaces that name them.
+"""Abaqus decks: nodes, elements of the body, and the sets and surfaces that name them.
 
 Own code because meshio knows few element types (not CPE3), no surfaces, and names the wrong cells
 where a block of elements has no set. Source: Abaqus Analysis User's Guide (2016), 2.2 (nodes,
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jaxcontact.scene.split_cells import FACES, shape_of
 from jaxcontact.transforms.files import check_is_file
 
 if TYPE_CHECKING:
@@ -25,16 +26,22 @@ if TYPE_CHECKING:
 #: Element types by shape, without the letters that choose a formulation.
 _TYPES = {
     "line": r"(T[23]D2|B[23][13]|R2D2|RAX2|DC1D2|SAX1)[A-Z]*",
+    "line3": r"(T[23]D3|B[23]2|DC1D3|SAX2)[A-Z]*",
     "triangle": r"(CPS3|CPE3|CPEG3|CAX3|S3|STRI3|R3D3|M3D3|SFM3D3|DC2D3|DS3)[A-Z]*",
+    "triangle6": r"(CPS6|CPE6|CPEG6|CAX6|STRI65|M3D6|SFM3D6|DC2D6|DS6)[A-Z]*",
+    "quad": r"(CPS4|CPE4|CPEG4|CAX4|S4|R3D4|M3D4|SFM3D4|DC2D4|DS4)[A-Z]*5?",
+    "quad8": r"(CPS8|CPE8|CPEG8|CAX8|S8|M3D8|SFM3D8|DC2D8|DS8)[A-Z]*5?",
+    "quad9": r"M3D9[A-Z]*",
     "tetra": r"(D?C3D4)[A-Z]*",
+    "tetra10": r"(D?C3D10)[A-Z]*",
+    "pyramid": r"(D?C3D5)[A-Z]*",
+    "wedge": r"(D?C3D6|SC6)[A-Z]*",
+    "wedge15": r"(D?C3D15)[A-Z]*",
+    "hexahedron": r"(D?C3D8|SC8)[A-Z]*",
+    "hexahedron20": r"(D?C3D20)[A-Z]*",
+    "hexahedron27": r"C3D27[A-Z]*",
 }
-#: Local nodes of the faces S1, S2, ... of each shape.
-_FACES = {
-    "line": ((0,), (1,)),
-    "triangle": ((0, 1), (1, 2), (2, 0)),
-    "tetra": ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)),
-}
-_FACE_SHAPE = {1: "vertex", 2: "line", 3: "triangle"}
+_FACE_SHAPE = {1: "vertex", 2: "line", 3: "triangle", 4: "quad"}
 
 
 class _Section(NamedTuple):
@@ -46,7 +53,7 @@ class _Section(NamedTuple):
 
 
 class _Element(NamedTuple):
-    shape: str
+    kind: str
     block: int
     row: int
     nodes: tuple[int, ...]
@@ -57,8 +64,8 @@ def read_deck(path: Path) -> meshio.Mesh:
 
     Raises:
         OSError: if the deck or a file that it includes cannot be opened.
-        ValueError: if the deck is not flat, has elements that are no linear simplices, or names
-            something that it does not define.
+        ValueError: if the deck is not flat, has elements of other kinds, or names something that
+            it does not define.
     """
     # Here and not above: its import takes longer than that of this package without JAX.
     import meshio
@@ -116,22 +123,24 @@ class _Deck:
 
     def add_element(self, section: _Section) -> None:
         kind = section.options.get("TYPE", "").upper()
-        shapes = [shape for shape, types in _TYPES.items() if re.fullmatch(types, kind)]
-        if not shapes:
+        cells = [cell for cell, types in _TYPES.items() if re.fullmatch(types, kind)]
+        if not cells:
             raise ValueError(
-                f"element type {kind or '(none)'} is no linear simplex; mesh the body "
-                "with CPE3 or CPS3 triangles or C3D4 tetrahedra, and leave out other elements"
+                f"element type {kind or '(none)'} is not supported; mesh the body with CPE3 or "
+                "CPS3 triangles or C3D4 tetrahedra, and leave out other elements"
             )
-        (shape,) = shapes
+        (cell,) = cells
         entries = np.array([int(x) for row in section.rows for x in row if x], dtype=np.int64)
-        n_entries = len(_FACES[shape]) + 1
+        n_entries = int("".join(filter(str.isdecimal, cell)) or shape_of(cell)[1]) + 1
         if entries.size % n_entries:
             raise ValueError(f"type {kind} needs {n_entries} numbers per element: itself and nodes")
         entries = entries.reshape(-1, n_entries)
+        if cell == "line3":  # its middle is the second node
+            entries = entries[:, [0, 1, 3, 2]]
         nodes = [tuple(self._number("node", int(k)) for k in row) for row in entries[:, 1:]]
         for row, (number, corners) in enumerate(zip(entries[:, 0], nodes, strict=True)):
-            self.elements[int(number)] = _Element(shape, len(self.blocks), row, corners)
-        self.blocks.append((shape, np.array(nodes, np.int64).reshape(-1, n_entries - 1)))
+            self.elements[int(number)] = _Element(cell, len(self.blocks), row, corners)
+        self.blocks.append((cell, np.array(nodes, np.int64).reshape(-1, n_entries - 1)))
         if "ELSET" in section.options:
             self._extend(self.element_sets, section, "ELSET", entries[:, 0].tolist())
 
@@ -189,12 +198,13 @@ class _Deck:
 
     def _sides(self, element: _Element, side: str) -> list[tuple[int, ...]]:
         """Return the face that a label such as S2 names, or without one all outer faces."""
-        faces = [tuple(element.nodes[k] for k in face) for face in _FACES[element.shape]]
+        shape = shape_of(element.kind)[0]
+        faces = [tuple(element.nodes[k] for k in face) for face in FACES[shape]]
         if not side:
             return [face for face in faces if self._face_counts[frozenset(face)] == 1]
         labels = [f"{letter}{k + 1}" for k in range(len(faces)) for letter in "SE"]
         if side not in labels:
-            raise ValueError(f"a {element.shape} has no face {side}; use {labels}")
+            raise ValueError(f"a {shape} has no face {side}; use {labels}")
         return [faces[labels.index(side) // 2]]
 
     @cached_property
@@ -202,7 +212,7 @@ class _Deck:
         return Counter(
             frozenset(element.nodes[k] for k in face)
             for element in self.elements.values()
-            for face in _FACES[element.shape]
+            for face in FACES[shape_of(element.kind)[0]]
         )
 
     def _listed(self, sets: dict[str, list[int]], kind: str, section: _Section) -> list[int]:

@@ -1,10 +1,11 @@
-"""Arithmetic on the cells of a simplicial mesh: volumes, boundary facets, connected parts."""
+"""Arithmetic on the cells of a simplicial mesh: volumes, facets, connected parts."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
@@ -67,6 +68,33 @@ def boundary_facets(cells: np.ndarray) -> np.ndarray:
             f"{crowded[0].tolist()}: remove duplicate or overlapping cells"
         )
     return facets[np.sort(order[starts[counts == 1]])].astype(np.int32)
+
+
+def end_signs(cells: np.ndarray) -> np.ndarray:
+    """Return in one dimension 1 and -1 at right and left ends of bodies, (N,); else (0,)."""
+    if cells.shape[1] > 2:
+        return np.zeros(0)
+    n_nodes = int(cells.max()) + 1
+    counts = [np.bincount(cells[:, side], minlength=n_nodes) for side in (0, 1)]
+    return np.asarray(counts[1] - counts[0], float)
+
+
+def area_vectors(points: Any, facets: np.ndarray, ends: Any) -> Any:
+    """Return outward normals of facets, as long as their areas, (F, d) [m^(d-1)].
+
+    Args:
+        points: node positions, (N, d) [m].
+        facets: (F, d).
+        ends: see `end_signs`.
+    """
+    xp: Any = np if isinstance(points, np.ndarray) else jnp
+    d = points.shape[1]
+    if d == 1:
+        return xp.asarray(ends, points.dtype)[facets]
+    edges = points[facets[:, 1:]] - points[facets[:, :1]]
+    if d == 2:
+        return xp.stack([edges[:, 0, 1], -edges[:, 0, 0]], axis=1)
+    return 0.5 * xp.cross(edges[:, 0], edges[:, 1])
 
 
 def facet_keys(facets: np.ndarray, n_nodes: int) -> np.ndarray:

@@ -6,7 +6,7 @@ then by Newton's method; its derivative is that of the equation,
 
     dt = -(dphi + grad phi . (dx + t dnu)) / (grad phi . nu).
 
-Source: MATH.md 10.
+Source: MATH.md 11.
 """
 
 from __future__ import annotations

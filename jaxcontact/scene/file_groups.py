@@ -1,7 +1,8 @@
 """The named groups of cells and nodes in a mesh file, in whatever way its format names them.
 
-Gmsh numbers and names physical groups; Abaqus, Exodus and others have sets of cells and nodes;
-Medit, SU2 and TetGen give each cell a number, as VTK files do by an integer array of any name.
+Gmsh numbers and names physical groups; MED numbers families, each of which belongs to any number of
+named groups; Abaqus, Exodus and others have sets of cells and nodes; Medit, SU2 and TetGen give
+each cell a number, as VTK files do by an integer array of any name.
 """
 
 from __future__ import annotations
@@ -57,7 +58,12 @@ def node_groups(
         boundary: all boundary facets in new numbers, (B,d).
     """
     facets = {}
-    for name, nodes in source.point_sets.items():
+    sets = dict(source.point_sets)
+    for tag, names in getattr(source, "point_tags", {}).items():
+        inside = np.flatnonzero(source.point_data["point_tags"] == tag)
+        for name in names:
+            sets[name] = np.concatenate([sets.get(name, inside[:0]), inside])
+    for name, nodes in sets.items():
         inside = np.isin(boundary, number[np.asarray(nodes, dtype=np.int64)]).all(axis=1)
         if inside.any():
             facets[name] = boundary[inside]
@@ -111,14 +117,15 @@ def _named_rows(
         if block.type != SIMPLICES[dimension]:
             continue
         for key, blocks in arrays.items():
-            is_format = key in _FORMAT_NUMBERS
+            is_format = key in _FORMAT_NUMBERS or (key == "cell_tags" and bool(names))
             # Gmsh gives a reversed group the negative number.
             numbers = np.abs(blocks[i]) if key == "gmsh:physical" else blocks[i]
             for value in np.unique(numbers):
                 if is_format and value == 0:
                     continue
-                name = names.get(int(value), str(value)) if is_format else f"{key}:{value}"
-                yield name, start + np.flatnonzero(numbers == value)
+                own = [str(value)] if is_format else [f"{key}:{value}"]
+                for name in names.get(int(value), own) if is_format else own:
+                    yield name, start + np.flatnonzero(numbers == value)
         for name, blocks in source.cell_sets.items():
             # The bounding entities of Gmsh are None for a point.
             if not name.startswith("gmsh:") and np.size(blocks[i]):
@@ -137,11 +144,14 @@ def _is_numbering(path: Path, key: str, blocks: list) -> bool:
     return n_groups <= _MOST_GROUPS
 
 
-def _names_of_numbers(path: Path, source: meshio.Mesh, dimension: int) -> dict[int, str]:
+def _names_of_numbers(path: Path, source: meshio.Mesh, dimension: int) -> dict[int, list[str]]:
     """Return the names that a file gives to the numbers of its groups."""
     if "su2:tag" in source.cell_data:
-        return _su2_markers(path)
-    return {int(tag): name for name, (tag, d) in source.field_data.items() if d == dimension}
+        return {number: [name] for number, name in _su2_markers(path).items()}
+    if "gmsh:physical" in source.cell_data:
+        named = source.field_data.items()
+        return {int(tag): [name] for name, (tag, d) in named if d == dimension}
+    return getattr(source, "cell_tags", {})
 
 
 def _su2_markers(path: Path) -> dict[int, str]:

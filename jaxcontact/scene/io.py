@@ -12,8 +12,10 @@ import numpy as np
 
 from jaxcontact.scene.abaqus import read_deck
 from jaxcontact.scene.cells import boundary_facets, cell_volumes
+from jaxcontact.scene.exodus import read_exodus
 from jaxcontact.scene.file_groups import SIMPLICES, boundary_groups, cell_groups, node_groups
 from jaxcontact.scene.mesh import Mesh
+from jaxcontact.scene.split_cells import make_simplicial
 from jaxcontact.transforms.files import check_is_file
 
 if TYPE_CHECKING:
@@ -76,14 +78,17 @@ def _count_empty(file: _EndingText | _EndingBytes, line: Line) -> Line:
 
 
 def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> Mesh:
-    """Read the simplices of the highest dimension in a file, with its named groups.
+    """Read the cells of the highest dimension in a file as simplices, with its named groups.
 
     Holds afterwards: nodes that no cell uses are gone, constant trailing coordinates of line and
-    planar meshes are dropped, and inverted cells are turned over.
+    planar meshes are dropped, and inverted cells are turned over. Cells of higher order are read by
+    their corners, quadrilaterals, pyramids, wedges and hexahedra are cut into simplices that fit
+    (`scene/split_cells.py`); both with a warning.
 
     Named groups become facet sets where they hold facets and regions where they hold cells:
 
-    - Gmsh physical groups, and the sets of elements and surfaces of Abaqus and others, by name;
+    - Gmsh physical groups, groups of MED, blocks and side sets of Exodus, and the sets of elements
+      and surfaces of Abaqus and others, by name;
     - sets of nodes by name, as the boundary facets that have all their nodes in the set;
     - groups that only have a number (Gmsh, Medit, SU2, TetGen) by that number, such as "7";
     - integer cell data of other formats (VTK, VTU) by array and number, such as "mat_id:7".
@@ -102,13 +107,14 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
     Raises:
         OSError: There is no file, it is a folder, or it cannot be opened.
         ImportError: The format needs another package, as XDMF and MED need h5py.
-        ValueError: The file cannot be read as a mesh, has no simplices of this dimension, has other
-            cells of this dimension, names nodes that it does not have, lacks the cells of the
-            body, is a curved or tilted surface or curve, or holds a mesh that `Mesh.from_arrays`
-            refuses.
+        ValueError: The file cannot be read as a mesh, has no cells of this dimension, has cells
+            that are not convex or no polytopes with corners, names nodes that it does not have,
+            lacks the cells of the body, is a curved or tilted surface or curve, or holds a mesh
+            that `Mesh.from_arrays` refuses.
     """
     path = Path(path)
     source = _read(path)
+    make_simplicial(path, source)
     d = dimension if dimension is not None else max((b.dim for b in source.cells), default=0)
     if d not in (1, 2, 3):
         raise ValueError(
@@ -117,7 +123,7 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
     others = sorted({b.type for b in source.cells if b.dim == d and b.type != SIMPLICES[d]})
     if others:
         raise ValueError(
-            f"{path}: cells of type {', '.join(others)} are not linear simplices; split them into "
+            f"{path}: cells of type {', '.join(others)} are not supported; split them into "
             f"{SIMPLICES[d]} cells or mesh again (Gmsh: -order 1 and no recombination)"
         )
     if dimension is None and d < _gmsh_dimension(path):
@@ -126,7 +132,7 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
             f"{_contents(source)}, since the body is in no physical group; put it into one, or "
             f"read the {SIMPLICES[d]} cells with dimension={d}"
         )
-    corners = _simplices(path, source, d)
+    corners = _simplices(source, d)
     if not len(corners):
         raise ValueError(
             f"{path}: no {SIMPLICES[d]} cells; the file has {_contents(source)}: choose another "
@@ -143,7 +149,7 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
     boundary = boundary_facets(cells)
     # Facets that are named as such go before those that a set of nodes encloses.
     facet_sets = node_groups(path, source, number, boundary) | boundary_groups(
-        path, cell_groups(path, source, d - 1), number[_simplices(path, source, d - 1)], boundary
+        path, cell_groups(path, source, d - 1), number[_simplices(source, d - 1)], boundary
     )
     return Mesh.from_arrays(points, cells, facet_sets, regions)
 
@@ -162,14 +168,20 @@ def _read(path: Path) -> meshio.Mesh:
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            if path.suffix.lower() in (".e", ".exo", ".ex2"):
+                return read_exodus(path)
             if path.suffix.lower() not in _ENDLESS:
                 return meshio.read(path)
             file_format, is_text = _ENDLESS[path.suffix.lower()]
             file = _EndingBytes(path.open("rb", buffering=0))
             with _EndingText(file) if is_text else file as lines:
                 return meshio.read(lines, file_format)
-    except (OSError, ImportError):
+    except OSError:
         raise
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: {error}; pip install 'jaxcontact[formats]' for what this format needs"
+        ) from error
     except (Exception, SystemExit) as error:
         reason = " ".join(said.getvalue().split()) or repr(error)
         advice = [text for words, text in _ADVICE.items() if words in reason] or [
@@ -210,18 +222,10 @@ def _contents(source: meshio.Mesh) -> str:
     return ", ".join(f"{n} {kind} cells" for kind, n in counts.items()) or "no cells"
 
 
-def _simplices(path: Path, source: meshio.Mesh, dimension: int) -> np.ndarray:
+def _simplices(source: meshio.Mesh, dimension: int) -> np.ndarray:
     """Node indices of all simplices of this dimension, in the file's order, (.,d+1)."""
     blocks = [block.data for block in source.cells if block.type == SIMPLICES[dimension]]
-    rows = np.concatenate([np.zeros((0, dimension + 1), np.int64), *blocks]).astype(np.int64)
-    outside = np.flatnonzero(((rows < 0) | (rows >= len(source.points))).any(axis=1))
-    if outside.size:
-        raise ValueError(
-            f"{path}: {outside.size} {SIMPLICES[dimension]} cells name nodes that are not in the "
-            f"file, the first {rows[outside[0]].tolist()} of nodes 0 to {len(source.points) - 1}; "
-            "write the file again"
-        )
-    return rows
+    return np.concatenate([np.zeros((0, dimension + 1), np.int64), *blocks]).astype(np.int64)
 
 
 def _drop_flat_axes(path: Path, points: np.ndarray, d: int) -> np.ndarray:

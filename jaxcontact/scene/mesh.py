@@ -15,18 +15,32 @@ Topology is concrete and lives on the host; node positions may be traced (shape 
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.cells import boundary_facets, cell_volumes, components, facet_keys
+from jaxcontact.scene.cells import (
+    area_vectors,
+    boundary_facets,
+    cell_volumes,
+    components,
+    end_signs,
+    facet_keys,
+)
+from jaxcontact.scene.mesh_checks import (
+    as_indices,
+    as_points,
+    check_cells,
+    check_geometry,
+    match_boundary,
+)
+from jaxcontact.scene.quality import MeshQuality, mesh_quality
+from jaxcontact.scene.refine import edges_of, refine_cells, refine_facets, refine_points
 from jaxcontact.transforms.traced import as_array, is_traced
 
 __all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
@@ -81,18 +95,18 @@ class Mesh:
         facets, regions = facets or {}, regions or {}
         if odd := [name for name in (*facets, *regions) if not isinstance(name, str)]:
             raise ValueError(f"facet sets and regions {odd} have to be named by strings")
-        x = _as_points(points)
+        x = as_points(points)
         n_nodes, d = x.shape
-        corners = _as_indices(cells, "cells", (d + 1,), n_nodes)
-        _check_cells(corners, n_nodes)
-        _check_geometry(x, corners)
+        corners = as_indices(cells, "cells", (d + 1,), n_nodes)
+        check_cells(corners, n_nodes)
+        check_geometry(x, corners)
         boundary = boundary_facets(corners)
         facet_sets = {}
         for name, facet_set in facets.items():
-            indices = _as_indices(facet_set, f"facet set {name!r}", (d,), n_nodes)
-            facet_sets[name] = _match_boundary(name, indices, boundary)
+            indices = as_indices(facet_set, f"facet set {name!r}", (d,), n_nodes)
+            facet_sets[name] = match_boundary(name, indices, boundary)
         cell_sets = {
-            name: _as_indices(region, f"region {name!r}", (), len(corners))
+            name: as_indices(region, f"region {name!r}", (), len(corners))
             for name, region in regions.items()
         }
         return cls(x, corners, facet_sets, cell_sets, layout=_layout(x, None))
@@ -111,10 +125,10 @@ class Mesh:
 
         Derivative: the identity from `points` to the field `points`.
         """
-        x = _as_points(points)
+        x = as_points(points)
         if x.shape != self.points.shape:
             raise ValueError(f"points have shape {x.shape}; pass {self.points.shape}, all nodes")
-        _check_geometry(x, self.cells)
+        check_geometry(x, self.cells)
         return dataclasses.replace(self, points=x, layout=_layout(x, self.layout))
 
     def moved(
@@ -158,6 +172,99 @@ class Mesh:
         )
         return mesh.with_points(move(self.points))
 
+    def refined(self) -> Mesh:
+        """The mesh with every edge halved: 2^d cells of half the size for each cell.
+
+        New nodes lie in the middle of the old edges and come after the old nodes, so that a curved
+        boundary stays the polygon that it is; move its nodes with `with_points`. The children of
+        cell k are the cells 2^d k to 2^d (k + 1) - 1; they do not degenerate, however often this is
+        repeated (`scene/refine.py`).
+
+        Returns:
+            The mesh, with the sets and regions that hold the children of their facets and cells.
+
+        Raises:
+            ValueError: In 3D if no concrete node positions are known, which choose the cut.
+
+        Derivative: by `points`.
+        """
+        edges, n_children = edges_of(self.cells), 2**self.dimension
+        choice = self.positions("refinement") if self.dimension == 3 else self.points
+        children = np.arange(n_children, dtype=np.int32)
+        return Mesh(
+            refine_points(self.points, edges),
+            refine_cells(self.cells, edges, choice),
+            {key: refine_facets(x, edges, self.n_nodes) for key, x in self.facets.items()},
+            {key: (n_children * x[:, None] + children).ravel() for key, x in self.regions.items()},
+            None if self.layout is None else refine_points(self.layout, edges),
+        )
+
+    def with_set(self, name: str, predicate: Callable[[np.ndarray, np.ndarray], ArrayLike]) -> Mesh:
+        """The mesh with one more facet set: the boundary facets that a function chooses.
+
+        Args:
+            name: Name of the new set.
+            predicate: Maps the centres (B,d) [m] and the outward unit normals (B,d) of all boundary
+                facets to bool (B,), for instance `lambda x, n: n[:, -1] < -0.7` for what looks
+                down. It gets NumPy arrays.
+
+        Returns:
+            The mesh with the set.
+
+        Raises:
+            ValueError: There is a set of this name, the function does not return one bool for each
+                facet or chooses none, or no concrete node positions are known.
+        """
+        if not isinstance(name, str) or name in self.facets:
+            raise ValueError(
+                f"a new facet set needs a name, a string, beside those of {sorted(self.facets)}; "
+                f"got {name!r}"
+            )
+        boundary = boundary_facets(self.cells)
+        x = self.positions("the choice of facets")
+        vectors = area_vectors(x, boundary, end_signs(self.cells))
+        normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        is_chosen = np.asarray(predicate(x[boundary].mean(axis=1), normals))
+        if is_chosen.dtype != bool or is_chosen.shape != (len(boundary),):
+            raise ValueError(
+                f"the predicate must return bool of shape ({len(boundary)},), one for each "
+                f"boundary facet; it returned {is_chosen.dtype} of shape {is_chosen.shape}"
+            )
+        if not is_chosen.any():
+            low, high = x[boundary].min(axis=(0, 1)), x[boundary].max(axis=(0, 1))
+            raise ValueError(
+                f"facet set {name!r}: the predicate chooses none of the {len(boundary)} boundary "
+                f"facets, whose nodes lie between {low.tolist()} and {high.tolist()}"
+            )
+        return dataclasses.replace(self, facets={**self.facets, name: boundary[is_chosen]})
+
+    def quality(self) -> MeshQuality:
+        """The mean ratio and the smallest height of every cell; print it to see the worst cells.
+
+        Raises:
+            ValueError: No concrete node positions are known.
+        """
+        return mesh_quality(self.positions("mesh quality"), self.cells)
+
+    def positions(self, purpose: str) -> np.ndarray:
+        """The node positions if they are concrete, else the last concrete ones, (N,d) [m].
+
+        Args:
+            purpose: What needs them, for the message.
+
+        Raises:
+            ValueError: There are none.
+        """
+        if not is_traced(self.points):
+            return np.asarray(self.points, float)
+        if self.layout is None or is_traced(self.layout):
+            raise ValueError(
+                f"{purpose} needs concrete node positions, and JAX traces them; build the mesh "
+                "outside of jit, grad and vmap and move its nodes there with "
+                "mesh.with_points(points)"
+            )
+        return np.asarray(self.layout, float)
+
     @property
     def dimension(self) -> int:
         """Space dimension d."""
@@ -191,97 +298,3 @@ def _is_rotation(matrix: np.ndarray) -> bool:
     """Whether a matrix (d,d) is a rotation, up to rounding in float32."""
     is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5)
     return is_orthogonal and np.linalg.det(matrix) > 0.0
-
-
-def _match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:
-    """The rows of `boundary` with the nodes of `facets`, (F,d), (B,d) -> (F,d)."""
-    n_nodes = int(max(facets.max(), boundary.max())) + 1
-    keys, boundary_keys = facet_keys(facets, n_nodes), facet_keys(boundary, n_nodes)
-    order = np.argsort(boundary_keys)
-    found = order[np.searchsorted(boundary_keys[order], keys).clip(max=len(order) - 1)]
-    stray = np.flatnonzero(boundary_keys[found] != keys)
-    if stray.size:
-        raise ValueError(
-            f"facet set {name!r}: rows {_listed(stray)} are not on the boundary, the first is "
-            f"{facets[stray[0]].tolist()}: choose rows of "
-            "jaxcontact.scene.mesh.boundary_facets(cells)"
-        )
-    repeated = np.flatnonzero(np.bincount(found)[found] > 1)
-    if repeated.size:
-        raise ValueError(
-            f"facet set {name!r}: rows {_listed(repeated)} are not unique: list each facet once"
-        )
-    return boundary[found]
-
-
-def _as_points(points: ArrayLike) -> Any:
-    """Node positions as float64 NumPy, or as the JAX array they are, with their shape checked."""
-    is_kept = isinstance(points, jax.Array) and jnp.issubdtype(points.dtype, jnp.floating)
-    array: Any = points if is_kept else np.array(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] not in (1, 2, 3) or not len(array):
-        raise ValueError(f"points have shape {array.shape}; pass 1, 2 or 3 coordinates per node")
-    return array
-
-
-def _as_indices(array: ArrayLike, what: str, columns: tuple[int, ...], size: int) -> np.ndarray:
-    """Concrete int32 indices of shape (rows, *columns) with values in [0, size)."""
-    if isinstance(array, Tracer):
-        raise ValueError(
-            f"{what}: topology must be concrete, but JAX traces it; build the mesh outside of "
-            "jit, grad and vmap and move its nodes there with mesh.with_points(points)"
-        )
-    indices = np.asarray(array)
-    if indices.size == 0:
-        raise ValueError(f"{what}: empty; list at least one or leave it out")
-    if indices.ndim != 1 + len(columns) or indices.shape[1:] != columns:
-        shape = ", ".join(["rows", *map(str, columns)])
-        raise ValueError(f"{what}: shape {indices.shape}, expected ({shape}) for this mesh")
-    if indices.dtype.kind not in "iu":
-        raise ValueError(f"{what}: dtype {indices.dtype}, expected integer indices counted from 0")
-    outside = np.flatnonzero(((indices < 0) | (indices >= size)).reshape(len(indices), -1).any(1))
-    if outside.size:
-        raise ValueError(
-            f"{what}: rows {_listed(outside)} have an index outside 0..{size - 1}, the first is "
-            f"{indices[outside[0]].tolist()}: count from 0 to the size of the mesh"
-        )
-    return indices.astype(np.int32)
-
-
-def _check_cells(cells: np.ndarray, n_nodes: int) -> None:
-    """Raise if a cell names a node twice or a node is in no cell."""
-    ordered = np.sort(cells, axis=1)
-    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
-    if repeated.size:
-        raise ValueError(f"cells {_listed(repeated)} name a node twice: remove these cells")
-    unused = np.flatnonzero(np.bincount(cells.ravel(), minlength=n_nodes) == 0)
-    if unused.size:
-        advice = "used, cells = np.unique(cells, return_inverse=True); points = points[used]"
-        raise ValueError(f"nodes {_listed(unused)} are in no cell: remove them ({advice})")
-
-
-def _check_geometry(points: Any, cells: np.ndarray) -> None:
-    """Raise if concrete positions are not finite or leave a cell without positive volume."""
-    if isinstance(points, Tracer) or isinstance(cells, Tracer):
-        return
-    x = np.asarray(points)
-    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-    if bad.size:
-        raise ValueError(f"nodes {_listed(bad)} have a NaN or infinite coordinate: correct them")
-    d = x.shape[1]
-    determinant = cell_volumes(x, cells) * math.factorial(d)
-    # A determinant this small cannot be told from zero after rounding the coordinates.
-    corners = x[cells]  # (N,d) -> (E,d+1,d)
-    diameter = np.ptp(corners, axis=1).max(axis=1)
-    round_off = 16 * np.finfo(x.dtype).eps * np.abs(corners).max(axis=(1, 2)) * diameter ** (d - 1)
-    degenerate = np.flatnonzero(np.abs(determinant) <= round_off)
-    if degenerate.size:
-        raise ValueError(f"cells {_listed(degenerate)} have no volume: remove or remesh them")
-    inverted = np.flatnonzero(determinant < 0)
-    if inverted.size:
-        advice = "cells[inverted, -2:] = cells[inverted, :-3:-1]"
-        raise ValueError(f"cells {_listed(inverted)} are inverted: swap two nodes ({advice})")
-
-
-def _listed(indices: np.ndarray) -> str:
-    """The first offending indices and how many there are."""
-    return f"{indices[:5].tolist()} ({len(indices)} in all)"

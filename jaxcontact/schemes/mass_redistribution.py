@@ -1,11 +1,16 @@
 """A mass matrix without mass on the contact nodes in contact direction.
 
-    M_r = E^T M E + C,    M_r N^T = 0.
+    M_r = E^T M E + C,    M_r S = 0.
+
+S projects on the contact directions: nu_i at the node of a contact pair, and between two bodies, at
+a node k of the other one that pairs meet with the shares m_ik, the direction of sum_i m_ik nu_i;
+with one direction nu for all, N = N S. A body whose surface keeps its mass would chatter against a
+massless one.
 
 E replaces the normal velocity of a contact node by that of the body just inside: (E v)_i =
 (I - nu nu^T) v_i + nu nu^T sum_j w_ij v_j with nodes j inside, sum_j w_ij = 1 and no tangential
 offset, sum_j w_ij (I - nu nu^T)(x_j - x_i) ~ 0. E^T M E is positive semidefinite with the kernel
-N^T and the total mass of M, but it moves the centre of mass by O(h^2). C, one small block on each
+S and the total mass of M, but it moves the centre of mass by O(h^2). C, one small block on each
 node inside, is the smallest correction that gives every rigid velocity field (1D: every affine
 one) of every body its kinetic energy back: mass, centre of mass and inertia of each connected part
 of the mesh are then those of M.
@@ -22,7 +27,6 @@ for moving the mass to the neighbours.
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from types import ModuleType
 
 import jax
@@ -36,59 +40,78 @@ from jaxcontact.system.block_matrix import (
     concatenate,
     from_symmetric,
     on_host,
-    scatter,
 )
 from jaxcontact.system.bodies import body_numbers
-from jaxcontact.system.sparse import ContactNormals
 from jaxcontact.system.system import System
+from jaxcontact.transforms.traced import poison_unless
 
 #: How dear a tangential offset of a donor is, against a distant donor.
 OFFSET_PENALTY = 1e4
+#: Share in the pairs of another body from which on a node has a contact direction.
+LEAST_SHARE = 1e-6
+
+
+def contact_directions(system: System) -> Array:
+    """Return the unit contact direction of each unknown node, zero elsewhere, (n/d, d).
+
+    It is that of the forces of equal pressure, N^T 1, up to the sign.
+    """
+    normals, d = system.normals, system.dimension
+    if normals.count == 0:  # of a reduced model too, whose unknowns are no components of nodes
+        return jnp.zeros((system.size, 1), system.dtype)
+    force = normals.transposed_product(jnp.ones(normals.count, system.dtype), system.size)
+    force = force.reshape(system.size // d, d)
+    squares = jnp.sum(force**2, axis=1, keepdims=True)
+    has_one = squares > LEAST_SHARE**2
+    return jnp.where(has_one, force * jax.lax.rsqrt(jnp.where(has_one, squares, 1.0)), 0.0)
+
+
+def along_directions(directions: Array, x: Array) -> Array:
+    """Return S x, (n,), of x (n,) and the contact directions (n/d, d)."""
+    nodal = x.reshape(directions.shape)
+    return (directions * jnp.sum(directions * nodal, axis=1, keepdims=True)).reshape(x.shape)
 
 
 def redistribute(system: System) -> BlockMatrix:
-    """Return M_r, singular: M_r N^T = 0.
+    """Return M_r, singular: M_r S = 0.
 
     Traceable in every value of the system; which nodes receive mass follows from the mesh alone.
+    A traced M_r that is indefinite is NaN.
 
     Raises:
-        ValueError: if the contact pairs are not one per node, a contact node has too few nodes
-            inside the body near it, or the mesh is so coarse that M_r is indefinite.
+        ValueError: if a node has two contact pairs, a contact node has too few nodes inside the
+            body near it, or the mesh is so coarse that M_r is indefinite.
     """
     _check_pairs(system)
     inward = _inward_shift(system)
     mass = inward.transpose() @ from_symmetric(system.mass.expand(), system.dimension) @ inward
     corrected = mass.plus(_moment_correction(system, mass))
-    _check_semidefinite(system, corrected)
-    return corrected
-
-
-def massless_rows(system: System) -> ContactNormals:
-    """Return the directions without mass: N, with unit rows where rollers have shortened them."""
-    rows = system.normals
-    if system.rollers is None:
-        return rows
-    lengths = jnp.linalg.norm(rows.weights, axis=1, keepdims=True)
-    return replace(rows, weights=rows.weights / lengths)
+    return _checked(system, corrected)
 
 
 def tangential_projection(system: System) -> BlockMatrix:
-    """Return I - Q with Q = N^T N."""
+    """Return I - S."""
     n_nodes, d = len(system.free_nodes), system.dimension
-    normals = on_host(massless_rows(system).weights)
-    pairs = np.asarray(system.node_numbers)[np.asarray(system.contact_nodes)]
-    outer = normals[:, :, None] * normals[:, None, :]
-    identity = np.tile(np.eye(d, dtype=system.dtype), (n_nodes, 1, 1))
+    directions = on_host(contact_directions(system))
+    identity = np.eye(d, dtype=system.dtype)[None]
     nodes = np.arange(n_nodes)
-    return BlockMatrix(nodes, nodes, identity - scatter(outer, pairs, n_nodes))
+    outer = directions[:, :, None] * directions[:, None, :]
+    return BlockMatrix(nodes, nodes, identity - outer)
+
+
+def _massless_nodes(system: System) -> np.ndarray:
+    """Return the nodes of contact pairs, and those of the other body that they meet, (K,)."""
+    unknowns = np.asarray(system.normals.unknowns)
+    return np.asarray(system.free_nodes)[np.unique(unknowns // system.dimension)]
 
 
 def _inward_shift(system: System) -> BlockMatrix:
     """Return E."""
     number = np.asarray(system.node_numbers)
-    contact_nodes = np.asarray(system.contact_nodes)
-    points, normals = on_host(system.points), on_host(massless_rows(system).weights)
-    pairs, donors, size = _donors(system)
+    contact_nodes = _massless_nodes(system)
+    points = on_host(system.points)
+    normals = on_host(contact_directions(system))[number[contact_nodes]]
+    pairs, donors, size = _donors(system, contact_nodes)
     offsets = points[donors] - points[contact_nodes[pairs]]  # (z, d)
     # Donors of one contact node are a row of the table; missing ones have no weight.
     column = np.arange(pairs.size) - np.searchsorted(pairs, pairs)
@@ -128,7 +151,7 @@ def _shift_weights(offsets, is_donor: np.ndarray, normals) -> Array | np.ndarray
 def _moment_correction(system: System, mass: BlockMatrix) -> BlockMatrix:
     """Return C, which gives every body of the mesh its own moments back."""
     body = body_numbers(system)[np.asarray(system.free_nodes)]
-    is_inside = ~np.isin(np.asarray(system.free_nodes), np.asarray(system.contact_nodes))
+    is_inside = ~np.isin(np.asarray(system.free_nodes), _massless_nodes(system))
     lost = from_symmetric(system.mass.expand(), system.dimension).plus(mass.scaled(-1.0))
     corrections = [
         _body_correction(system, lost, body == number, is_inside)
@@ -192,14 +215,14 @@ def rigid_fields(points: Array | np.ndarray) -> Array | np.ndarray:
     return xp.stack(fields, axis=-1).astype(points.dtype)
 
 
-def _donors(system: System) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return contact pair and donor node of every term of the shift, and the most donors of one."""
+def _donors(system: System, contact_nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the contact node, by its place, and the donor of every term, and the most of one."""
     is_donor = np.zeros(system.n_nodes, bool)
     is_donor[np.asarray(system.free_nodes)] = True
-    is_donor[np.asarray(system.contact_nodes)] = False
+    is_donor[contact_nodes] = False
     neighbours = np.asarray(system.nodal_mass.columns).T
     pairs, donors = [], []
-    for pair, node in enumerate(np.asarray(system.contact_nodes)):
+    for pair, node in enumerate(contact_nodes):
         ring = np.array([node])
         for _ in range(3):
             ring = np.unique(neighbours[ring])
@@ -226,28 +249,45 @@ def _numpy_of(*values: Array | np.ndarray) -> ModuleType:
     return jnp if any(isinstance(value, Tracer) for value in values) else np
 
 
-def _check_semidefinite(system: System, mass: BlockMatrix) -> None:
-    """Check a concrete M_r of a coarse mesh, where the correction is large."""
-    if isinstance(mass.blocks, Tracer) or system.size > 1000:
-        return
-    matrix = mass.to_symmetric(len(system.free_nodes)).to_scipy().toarray()
-    lowest, *_, largest = np.linalg.eigvalsh(matrix)
-    if lowest < -1e3 * np.finfo(matrix.dtype).eps * largest:
+def _checked(system: System, mass: BlockMatrix) -> BlockMatrix:
+    """Return M_r, after a check that it is positive where it should be, on a coarse mesh only.
+
+    The correction is large there. With its mean diagonal entry on the contact directions M_r is
+    positive definite or indefinite.
+    """
+    if system.size > 1000:
+        return mass
+    n_nodes, d = len(system.free_nodes), system.dimension
+    matrix = mass.to_symmetric(n_nodes)
+    directions = contact_directions(system)
+    scale = jnp.mean(matrix.diagonal())
+    held = jax.vmap(lambda x: matrix @ x + scale * along_directions(directions, x))
+    lower = jnp.linalg.cholesky(held(jnp.eye(n_nodes * d, dtype=system.dtype)))
+    is_positive = jnp.all(jnp.isfinite(lower))
+    if isinstance(is_positive, Tracer):
+        return mass._replace(blocks=poison_unless(is_positive, mass.blocks))
+    if not is_positive:
         raise ValueError(
             "the mesh is too coarse to move the mass of its contact nodes inside without moving "
             "the centre of mass; refine it, or use jc.ContactStabilized()"
         )
+    return mass
 
 
 def _check_pairs(system: System) -> None:
-    """Check that every contact pair is one node against a rigid obstacle."""
-    d, nodes = system.dimension, np.asarray(system.contact_nodes)
-    if system.size != d * len(system.free_nodes) or system.normals.unknowns.shape[1] != d:
+    """Check that every contact pair is one node against an obstacle or another body."""
+    if system.basis is not None:
         raise ValueError(
-            "RedistributedMass needs the nodes of a mesh against rigid obstacles, not a reduced "
-            "model or contact between two bodies; use jc.ContactStabilized()"
+            "RedistributedMass moves mass from contact nodes to their neighbours, and the unknowns "
+            "of a reduced model belong to no node; use jc.ContactStabilized()"
         )
+    nodes = np.asarray(system.contact_nodes)
     shared = nodes.size - np.unique(nodes).size
+    # Of the other body the nodes of many pairs may be one, but not one that has its own pair.
+    others = np.asarray(system.normals.unknowns)[:, system.dimension :]
+    own = np.asarray(system.normals.unknowns)[:, : system.dimension]
+    padded = others.reshape(len(nodes), -1, system.dimension) == own[:, None, :]
+    shared += np.intersect1d(others[~padded.reshape(others.shape)], own).size
     if shared:
         raise ValueError(
             f"{shared} nodes have more than one contact pair; RedistributedMass needs one normal "

@@ -8,6 +8,7 @@ from jax import Array
 
 from jaxcontact.contact import Bound
 from jaxcontact.schemes.interface import StepState
+from jaxcontact.system.pair_set import Pairs
 from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 
@@ -40,27 +41,28 @@ def velocity_bound(system: System, dt: Array, y: Array, v: Array) -> Bound:
         v: velocity at the start of the step, (n,) [m/s]; it bounds the rounding of the free motion.
     """
     # Of the contact nodes only: a reduction over all unknowns in every step shows in its time.
-    unknowns = system.normals.unknowns
-    largest = jnp.max(jnp.maximum(jnp.abs(y[unknowns]), dt * jnp.abs(v[unknowns])), initial=0.0)
+    touched = system.normals.touched
+    largest = jnp.max(jnp.maximum(jnp.abs(touched(y)), dt * jnp.abs(touched(v))), initial=0.0)
     resolution = _gap_resolution(system, y, largest) / dt
     return Bound((system.gap - system.normals @ y) / dt, resolution)
 
 
-def gap_resolution(system: System, y: Array) -> Array:
+def gap_resolution(pairs: Pairs, y: Array) -> Array:
     """Return the rounding error of the gap psi - N y and of what follows from y, (C,) [m].
 
     A smaller gap is closed. The geometry has the error of its positions, and the free motion that
     of A y, whose terms cancel: tau N D^-1 (tau A y) is at most some max |y|, for every tau. The
     largest y of the contact nodes stands for it; inside, a body at rest may move more.
     """
-    return _gap_resolution(system, y, jnp.max(jnp.abs(y[system.normals.unknowns]), initial=0.0))
+    largest = jnp.max(jnp.abs(pairs.normals.touched(y)), initial=0.0)
+    return _gap_resolution(pairs, y, largest)
 
 
-def _gap_resolution(system: System, y: Array, largest: Array) -> Array:
+def _gap_resolution(pairs: Pairs, y: Array, largest: Array) -> Array:
     """Return the resolution for terms of the free motion as large as a displacement, (C,)."""
-    weights = jnp.abs(system.normals.weights)
-    size = jnp.sum(weights * (jnp.abs(y[system.normals.unknowns]) + largest), axis=1)
-    rounding = system.gap_rounding + 4.0 * jnp.finfo(y.dtype).eps * size
+    weights = jnp.abs(pairs.normals.weights)
+    size = jnp.sum(weights * (jnp.abs(pairs.normals.touched(y)) + largest), axis=1)
+    rounding = pairs.gap_rounding + 4.0 * jnp.finfo(y.dtype).eps * size
     return jax.lax.stop_gradient(rounding)
 
 

@@ -13,6 +13,7 @@ comments: e cell, a b local node, i j component.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -153,7 +154,9 @@ class Neighbourhood(NamedTuple):
     """Whether a corner is in the set, (z, d+1) bool."""
 
 
-class SetForces(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SetForces:
     """Forces on the nodes around a set that moves as a whole; column j for a move along axis j."""
 
     mass: Array

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.compound import Along, gap_along
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.obstacle import Obstacle, gap_and_normals, position_sizes
@@ -22,7 +23,7 @@ from jaxcontact.scene.scene import Scene, contact_obstacles
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.block_matrix import concatenate
 from jaxcontact.system.mortar import directions, mortar_rows
-from jaxcontact.system.pairing import direction_of, end_signs, find_meeting
+from jaxcontact.system.pairing import direction_of, find_meeting
 from jaxcontact.system.pairs import ContactPairs
 from jaxcontact.system.twins import drop_twins
 from jaxcontact.transforms.traced import as_array, is_traced
@@ -93,7 +94,7 @@ def _obstacle_pairs(
     places = jnp.asarray(points[nodes])
     if isinstance(obstacle, Along):
         along = None if obstacle.direction is None else as_array(obstacle.direction)
-        ends = end_signs(scene.mesh)
+        ends = end_signs(scene.mesh.cells)
         normals = jnp.asarray(directions(points, facets, ends, along, nodes))
         gap, is_met = gap_along(obstacle, places, normals)
         if not is_traced(is_met):
@@ -129,7 +130,7 @@ def _body_pairs(
 ) -> ContactPairs:
     """Return the pairs of facets (F, d) of the named contact sets that may touch another body."""
     meeting = find_meeting(names, facets, other, scene.mesh, clamped_set)
-    rows = mortar_rows(points, facets, end_signs(scene.mesh), direction_of(other), meeting)
+    rows = mortar_rows(points, facets, end_signs(scene.mesh.cells), direction_of(other), meeting)
     places = jnp.asarray(points[meeting.nodes])
     both = jnp.max(2.0 * jnp.abs(places) + jnp.abs(rows.gap)[:, None], axis=0)
     rounding = _rounding(rows.gap, rows.normals, both, dtype)

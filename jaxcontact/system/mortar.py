@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.cells import area_vectors
 from jaxcontact.system.block_matrix import scatter
 from jaxcontact.transforms.traced import is_traced
 
@@ -144,23 +145,6 @@ def _rows(
 
 
 _traced_rows = jax.jit(_rows)
-
-
-def area_vectors(points: Values, facets: np.ndarray, ends: Values) -> Values:
-    """Return outward normals of facets, as long as their areas, (F, d) [m^(d-1)].
-
-    Args:
-        points: node positions, (N, d) [m].
-        facets: (F, d).
-        ends: in one dimension 1 or -1 at nodes that are the right or left end of a body, (N,).
-    """
-    xp, d = _numpy_of(points), points.shape[1]
-    if d == 1:
-        return xp.asarray(ends, points.dtype)[facets]
-    edges = points[facets[:, 1:]] - points[facets[:, :1]]
-    if d == 2:
-        return xp.stack([edges[:, 0, 1], -edges[:, 0, 0]], axis=1)
-    return 0.5 * xp.cross(edges[:, 0], edges[:, 1])
 
 
 def directions(

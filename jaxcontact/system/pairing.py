@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxcontact.scene.cells import area_vectors, end_signs
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.mesh import Mesh
-from jaxcontact.system.mortar import Meeting, area_vectors, directions, meet, overlap, project
-from jaxcontact.transforms.traced import is_traced
+from jaxcontact.system.mortar import Meeting, directions, meet, overlap, project
 
 #: Least cosine between the direction and the normal of a facet that sees or is seen.
 STEEPEST = 0.1
@@ -46,7 +46,8 @@ def find_meeting(
     Raises:
         ValueError: if no concrete positions are known or no node sees the other body.
     """
-    x, ends = _positions(mesh), end_signs(mesh)
+    x = mesh.positions("the search of the facets that meet")
+    ends = end_signs(mesh.cells)
     nodes, place = np.unique(slave, return_inverse=True)
     nu = directions(x, slave, ends, direction_of(facets), nodes)
 
@@ -102,26 +103,6 @@ def find_meeting(
 def direction_of(facets: Facets) -> np.ndarray | None:
     """Return the contact direction, (d,), or None for the normals of the contact set."""
     return None if facets.along is None else np.asarray(facets.along, float)
-
-
-def end_signs(mesh: Mesh) -> np.ndarray:
-    """Return in one dimension 1 and -1 at right and left ends of bodies, (N,); else (0,)."""
-    if mesh.dimension > 1:
-        return np.zeros(0)
-    counts = [np.bincount(mesh.cells[:, side], minlength=mesh.n_nodes) for side in (0, 1)]
-    return np.asarray(counts[1] - counts[0], float)
-
-
-def _positions(mesh: Mesh) -> np.ndarray:
-    if not is_traced(mesh.points):
-        return np.asarray(mesh.points, float)
-    if mesh.layout is None or is_traced(mesh.layout):
-        raise ValueError(
-            "contact between bodies searches the facets that meet on concrete node positions, and "
-            "JAX traces them; build the mesh outside of jit, grad and vmap and move its nodes "
-            "there with mesh.with_points(points)"
-        )
-    return np.asarray(mesh.layout, float)
 
 
 def _cosines(vectors: np.ndarray, nu: np.ndarray) -> np.ndarray:

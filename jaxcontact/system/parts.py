@@ -5,20 +5,24 @@ Small arrays only: what belongs to one facet set, or to the nodes around it.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.assembly import Neighbourhood, SetForces
-from jaxcontact.system.pairing import end_signs
 from jaxcontact.system.pairs import ContactPairs
+from jaxcontact.transforms.traced import take_rows
 
 
-class ClampedSet(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ClampedSet:
     """A clamped facet set: what the rest of the scene feels when it moves as a whole."""
 
     nodes: np.ndarray
@@ -37,7 +41,9 @@ class ClampedSet(NamedTuple):
     """Share of the set in what each contact pair is measured from, (C,); zero without `Facets`."""
 
 
-class Parts(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Parts:
     """The named parts of a scene with C contact pairs."""
 
     facets: dict[str, np.ndarray]
@@ -52,6 +58,15 @@ class Parts(NamedTuple):
 
     clamped: dict[str, ClampedSet]
     """The clamped sets."""
+
+    def with_pairs(self, kept: np.ndarray) -> Parts:
+        """Return the parts with some of the contact pairs, their numbers (P,) int."""
+        clamped = {
+            name: replace(moved, shares=take_rows(moved.shares, kept))
+            for name, moved in self.clamped.items()
+        }
+        obstacles = {name: take_rows(members, kept) for name, members in self.obstacles.items()}
+        return replace(self, obstacles=obstacles, clamped=clamped)
 
 
 def named_parts(
@@ -89,4 +104,4 @@ def named_parts(
             is_alone=np.asarray(shared.size == 0),
             shares=jnp.asarray(pairs.held[:, number], dtype),
         )
-    return Parts(dict(mesh.facets), end_signs(mesh), obstacles, clamped)
+    return Parts(dict(mesh.facets), end_signs(mesh.cells), obstacles, clamped)

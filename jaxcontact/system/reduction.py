@@ -1,46 +1,83 @@
 """Reduced models: Galerkin projection that keeps every structural property of the full system.
 
-The space holds the lowest free vibrations, A phi = omega^2 M phi, and the static responses to a
-unit normal force on each contact pair, A z = N^T e_i: without them the local deformation at the
-contact, and with it the contact force, does not converge. Dissipation, the contact problem and
-the exact adjoint carry over, because the reduced system is again a system.
-Source: Craig, Bampton, AIAA J. 6 (1968); MacNeal, Comput. Struct. 1 (1971).
+The space holds the lowest free vibrations, A phi = omega^2 M phi, and what they cannot follow: the
+static responses A z = N^T e_i to a unit force on each contact pair, without which the deformation
+at the contact does not converge, and A z = f to every load that is known. With the responses
+D z = N^T e_i of one time step, D = M + tau/2 B + tau^2/4 A, the contact problem of a step has the
+compliance N D^-1 N^T of the full system. Dissipation, the contact problem and the exact adjoint
+carry over, because the reduced system is again a system.
+Source: Craig, Bampton, AIAA J. 6 (1968); MacNeal, Comput. Struct. 1 (1971); MATH.md 10.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-import scipy.sparse.linalg
-from jax.core import Tracer
+from jax import Array
+from numpy.typing import ArrayLike
 
+from jaxcontact.system.basis import Basis
+from jaxcontact.system.pair_set import pair_numbers
+from jaxcontact.system.reduced_space import HostSystem, Target, space
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
-from jaxcontact.system.system import Basis, System
-from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.system.system import System
+from jaxcontact.transforms.traced import is_traced
 
 
-@in_full_precision
-def reduce(system: System, modes: int, *, contact_responses: bool = True) -> System:
-    """Project a system on its lowest modes and its responses to contact forces.
+class Motion(Protocol):
+    """A motion to learn from: a `Trajectory`."""
 
-    The basis is computed once on the host; the reduced matrices are differentiable by the values
-    of the full ones with the basis held fixed.
+    @property
+    def displacement(self) -> Array:
+        """Nodal displacement, (T+1, N, d) [m]."""
+        ...
+
+
+def reduce(
+    system: System,
+    modes: int | None = None,
+    *,
+    frequency: float | None = None,
+    tolerance: float | None = None,
+    loads: Sequence[ArrayLike] = (),
+    pairs: ArrayLike | None = None,
+    step_responses: float | None = None,
+    training: Sequence[Motion] = (),
+) -> System:
+    """Project a system on its lowest modes and its responses to contact and load.
+
+    The space is computed once on the host, from concrete matrices; with m modes, C pairs that can
+    touch and p loads it has at most m + C + p dimensions, 2 C with step responses. In three
+    dimensions modes buy much less accuracy than in two.
 
     Args:
         system: the full system, with concrete matrices.
-        modes: number of free vibrations.
-        contact_responses: add the static response to each contact pair (recommended).
+        modes: number m of free vibrations; or one of the next two.
+        frequency: take all free vibrations up to this frequency, [Hz].
+        tolerance: take as many as a relative error of the displacement of about this size needs,
+            between 0 and 1: they leave this part of the first correction A^-1 M A^-1 f of a static
+            response by inertia, in the norm of the elastic energy, for every load f that is known
+            and for a uniform contact pressure. `reduction_error` measures the error.
+        loads: patterns of the force density that will act, each (N, d) [N/m^d]; the load of the
+            scene is known already.
+        pairs: pairs that can touch, see `System.with_pairs`; None is all of them.
+        step_responses: length of the time step, [s], with which the step responses are made; for
+            forces and impulses that are right in every step.
+        training: trajectories of similar motions; their principal components take the place of
+            the upper half of the modes.
 
     Returns:
-        A system with at most `modes` + C unknowns and dense matrices, used like any other;
-        displacements and controls keep their shapes.
+        A system with dense matrices, used like any other. Displacements keep their shapes;
+        controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced, reduced already or has rollers, or `modes` does not lie
-            between 1 and n - 1.
+        ValueError: if the system is traced, reduced already or has rollers, not exactly one of
+            modes, frequency and tolerance is given, or an argument is out of its range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
@@ -48,64 +85,111 @@ def reduce(system: System, modes: int, *, contact_responses: bool = True) -> Sys
         raise ValueError(
             "a system with rollers is not reduced; clamp the facet set, or use the full system"
         )
-    if isinstance(system.stiffness.values, Tracer):
+    matrices = (system.mass, system.stiffness, system.viscosity, system.normals, system.load)
+    if is_traced((matrices, system.nodal_mass, loads)):
         raise ValueError(
-            "reduce needs concrete matrices, since it computes eigenvectors on the host; call it "
-            "outside of jit, grad and vmap"
+            "reduce needs concrete matrices and loads, since it computes eigenvectors on the host; "
+            "call it outside of jit, grad and vmap"
         )
-    if not 1 <= modes < system.size:
-        raise ValueError(f"modes must lie between 1 and n - 1 = {system.size - 1}, got {modes}")
-    vectors = _basis(system, modes, contact_responses)
-    V = jnp.asarray(vectors, system.dtype)
+    target = Target.of(system.size, modes, frequency, tolerance)
+    if step_responses is not None and not (np.ndim(step_responses) == 0 and step_responses > 0.0):
+        raise ValueError(f"step_responses must be a time step in seconds, got {step_responses}")
+    count = system.normals.count
+    chosen = np.arange(count) if pairs is None else pair_numbers(pairs, count)
+    part = system if pairs is None else system.with_pairs(chosen)
+    # Under jit too what is concrete stays so.
+    with jax.ensure_compile_time_eval():
+        patterns, snapshots = _loads(system, loads), _snapshots(system, training)
+        V, n_modes = space(HostSystem.of(part), patterns, snapshots, target, step_responses)
+        return _project(part, V, chosen, n_modes)
+
+
+def enrich(system: System, reduced: System, dt: float | None) -> System:
+    """Return a reduced model that contains another one, with twice as many vibrations.
+
+    Args:
+        system: the full system that was reduced.
+        reduced: its reduced model.
+        dt: time step of the step responses that it has too; None is without them.
+
+    Raises:
+        ValueError: if the system is not the one that was reduced.
+    """
+    basis = reduced.basis
+    if basis is None or system.basis is not None or len(basis.vectors) != system.size:
+        raise ValueError(
+            "hand over a full system and a model that jc.reduce made of it, got systems of "
+            f"{system.size} and {reduced.size} unknowns"
+        )
+    modes = min(2 * basis.modes, system.size - 1)
+    part = system.with_pairs(basis.pairs)
+    V, _ = space(
+        HostSystem.of(part),
+        _loads(system, ()),
+        np.zeros((system.size, 0)),
+        Target(modes, None, None),
+        dt,
+        np.asarray(basis.vectors, float),
+    )
+    # The gap may be another one than it was.
+    part = dataclasses.replace(part, gap=reduced.gap, gap_rounding=reduced.gap_rounding)
+    return _project(part, V, basis.pairs, modes)
+
+
+def _loads(system: System, patterns: Sequence[ArrayLike]) -> np.ndarray:
+    """Return the loads of all patterns and the load of the scene, (n, p) [N]."""
+    shape, nodal_mass = (system.n_nodes, system.dimension), system.nodal_mass.to_scipy()
+    columns = [np.asarray(system.load, float)]
+    for pattern in patterns:
+        if np.shape(pattern) != shape or not np.all(np.isfinite(np.asarray(pattern))):
+            raise ValueError(
+                f"each load must be finite with the shape (N, d) = {shape}, got "
+                f"{np.shape(pattern)}; write loads=[pattern]"
+            )
+        force = nodal_mass @ np.asarray(pattern, float)
+        columns.append(force[system.free_nodes].reshape(-1))
+    loads = np.stack(columns, axis=1)
+    return loads[:, np.any(loads != 0.0, axis=0)]
+
+
+def _snapshots(system: System, motions: Sequence[Motion]) -> np.ndarray:
+    """Return all displacements of the motions, (n, S), those of each motion of total size one."""
+    columns = [np.zeros((system.size, 0))]
+    for motion in motions:
+        y = np.asarray(motion.displacement, float)
+        if y.ndim != 3 or y.shape[1:] != (system.n_nodes, system.dimension):
+            raise ValueError(
+                f"training takes trajectories of this mesh, with displacements (T+1, N, d) = "
+                f"(T+1, {system.n_nodes}, {system.dimension}); got {y.shape}"
+            )
+        free = y[:, system.free_nodes].reshape(len(y), -1).T
+        size = np.linalg.norm(free)
+        columns.append(free / (size if size > 0.0 else 1.0))
+    return np.concatenate(columns, axis=1)
+
+
+def _project(system: System, V: np.ndarray, pairs: np.ndarray, modes: int) -> System:
+    """Return the Galerkin projection on the columns of V, (n_full, n), in double precision."""
+    n, dtype, pairs = V.shape[1], system.dtype, pairs.astype(np.int32)
 
     def project(matrix: ComponentwiseMatrix | SymmetricMatrix) -> SymmetricMatrix:
-        reduced = V.T @ (matrix @ V)
-        return SymmetricMatrix(0.5 * (reduced + reduced.T), None)
+        reduced = V.T @ (matrix.to_scipy().astype(float) @ V)
+        return SymmetricMatrix(jnp.asarray(0.5 * (reduced + reduced.T), dtype), None)
 
-    normals = jnp.sum(system.normals.weights[:, :, None] * V[system.normals.unknowns], axis=1)
-    unknowns = np.broadcast_to(np.arange(V.shape[1], dtype=np.int32), normals.shape)
+    def dense(normals: ContactNormals) -> ContactNormals:
+        return ContactNormals(jnp.asarray(normals.to_scipy() @ V, dtype), None, n)
+
+    beside = system.open_pairs
     return dataclasses.replace(
         system,
-        mass=project(system.mass),
+        mass=ComponentwiseMatrix(SymmetricMatrix(jnp.ones((1, 1), dtype), None), n),
         stiffness=project(system.stiffness),
         viscosity=None if system.viscosity is None else project(system.viscosity),
         l2_mass=project(system.l2_mass),
-        normals=ContactNormals(normals, unknowns, V.shape[1]),
-        load=system.load @ V,
-        basis=Basis(V, system.mass @ V),
+        normals=dense(system.normals),
+        load=jnp.asarray(np.asarray(system.load, float) @ V, dtype),
+        basis=Basis(jnp.asarray(V, dtype), system.mass, system.normals, pairs, modes),
+        open_pairs=None
+        if beside is None
+        else dataclasses.replace(beside, normals=dense(beside.normals)),
     )
-
-
-def _basis(system: System, modes: int, contact_responses: bool) -> np.ndarray:
-    """Return M-orthonormal basis vectors, (n, m)."""
-    mass, stiffness = system.mass.to_scipy(), system.stiffness.to_scipy()
-    # A free body has rigid motions, on which the stiffness vanishes: shift by a small frequency.
-    shift = 1e-3 * _lowest_scale(mass, stiffness)
-    solve = scipy.sparse.linalg.splu((stiffness + shift * mass).tocsc()).solve
-    shifted = scipy.sparse.linalg.LinearOperator(
-        mass.shape,
-        matvec=solve,  # type: ignore[reportCallIssue]
-        dtype=float,  # type: ignore[reportCallIssue]
-    )
-    start = np.random.default_rng(0).standard_normal(system.size)
-    _, vibrations = scipy.sparse.linalg.eigsh(
-        stiffness, k=modes, M=mass, sigma=-shift, OPinv=shifted, v0=start
-    )
-    vectors = vibrations
-    if contact_responses and system.normals.count:
-        responses = solve(system.normals.to_scipy().T.toarray())
-        vectors = np.concatenate([vibrations, responses], axis=1)
-    vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
-    # The square roots of the Gram matrix's eigenvalues are singular values in the M norm.
-    values, rotation = scipy.linalg.eigh(vectors.T @ (mass @ vectors))
-    keep = values > 1e-14 * values[-1]
-    vectors = vectors @ (rotation[:, keep] / np.sqrt(values[keep]))
-    # Once more: the first pass leaves errors of the size eps / smallest kept value.
-    factor = scipy.linalg.cholesky(vectors.T @ (mass @ vectors), lower=True)
-    return scipy.linalg.solve_triangular(factor, vectors.T, lower=True).T
-
-
-def _lowest_scale(mass, stiffness) -> float:
-    """Return a lower estimate of the squared elastic frequencies, by the largest one and n."""
-    largest = scipy.sparse.linalg.norm(stiffness, 1) / scipy.sparse.linalg.norm(mass, 1)
-    return float(largest) / mass.shape[0]

@@ -11,7 +11,7 @@ motion w = P w from the contact problem with
 
 That is the problem on the range of P: what an elimination in a basis turned into the directions of
 the rollers leaves out, stays here with the equation s (I - P) w = 0. The schemes see nothing of it.
-Source: MATH.md 10.
+Source: MATH.md 11.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.block_matrix import concatenate, scatter
 from jaxcontact.system.mortar import area_vectors
-from jaxcontact.system.pairing import end_signs
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.traced import as_array, is_traced
 
@@ -91,7 +91,8 @@ def hold_rows(rollers: ContactNormals | None, rows: ContactNormals) -> ContactNo
     """Return N P, (C, n)."""
     if rollers is None:
         return rows
-    d = rollers.unknowns.shape[1]
+    d = rollers.weights.shape[1]
+    assert rows.unknowns is not None
     weights = rows.weights.reshape(rows.count, rows.weights.shape[1] // d, d)  # (C, node, i)
     nodes = np.asarray(rows.unknowns).reshape(weights.shape)[:, :, 0] // d
     held = jnp.einsum("cni,cnij->cnj", weights, _projections(rollers)[nodes])
@@ -125,7 +126,8 @@ def check_movable(scene: Scene, rows: ContactNormals, nodes: np.ndarray) -> None
 def _projections(rollers: ContactNormals) -> Array:
     """Return the block of P of each node, (n/d, d, d)."""
     assert rollers.size is not None
-    d = rollers.unknowns.shape[1]
+    assert rollers.unknowns is not None
+    d = rollers.weights.shape[1]
     outer = rollers.weights[:, :, None] * rollers.weights[:, None, :]
     identity = jnp.tile(jnp.eye(d, dtype=outer.dtype), (rollers.size // d, 1, 1))
     return identity.at[rollers.unknowns[:, 0] // d].add(-outer)
@@ -159,7 +161,7 @@ def _facet_normals(
     sets = [mesh.facets[name] for name, vector in scene.rollers.items() if vector is None]
     if not sets:
         return np.zeros(0, int), np.zeros((0, points.shape[1]))
-    facets, ends = np.unique(np.concatenate(sets), axis=0), end_signs(mesh)
+    facets, ends = np.unique(np.concatenate(sets), axis=0), end_signs(mesh.cells)
     node, row = _sides(facets, area_vectors(_known_positions(mesh), facets, ends))
     vectors = area_vectors(points, facets, ends)
     return node, scatter(

@@ -20,6 +20,7 @@ from jax import Array
 
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.symmetric_product import symmetric_product, take
+from jaxcontact.transforms.traced import take_rows
 
 __all__ = ["ComponentwiseMatrix", "ContactNormals", "SymmetricMatrix", "take", "unknown_columns"]
 
@@ -156,15 +157,16 @@ class ContactNormals:
     """The contact operator N of shape (C, n): row i maps y to the normal displacement of pair i.
 
     Each row touches k unknowns: the d components of one contact node, and of the nodes of another
-    body that it may meet.
+    body that it may meet. In a reduced model it touches all of them, and N is dense.
     """
 
     weights: Array
     """Entries, (C, k); for a rigid obstacle the components of the unit normal nu_i, for another
-    body followed by -m_ij nu_i (see `mortar.py`)."""
+    body followed by -m_ij nu_i (see `mortar.py`). Dense: (C, n)."""
 
-    unknowns: Array | np.ndarray
-    """Unknown of each entry, (C, k) int32; entries that are padded name their own with weight 0."""
+    unknowns: Array | np.ndarray | None
+    """Unknown of each entry, (C, k) int32; entries that are padded name their own with weight 0.
+    None is dense (a reduced model)."""
 
     size: int | None = field(default=None, metadata={"static": True})
     """Number of all unknowns, n; None where it does not matter."""
@@ -172,15 +174,30 @@ class ContactNormals:
     @property
     def count(self) -> int:
         """Number of contact pairs, C."""
-        return self.unknowns.shape[0]
+        return self.weights.shape[-2]
 
+    @in_full_precision
     @jax.jit
     def __matmul__(self, y: Array) -> Array:
         """Return N y, (C,), for y (n,)."""
+        if self.unknowns is None:
+            return self.weights @ y
         return jnp.sum(self.weights * y[self.unknowns], axis=1)
 
+    def touched(self, y: Array) -> Array:
+        """Return the entries of y (n,) that each row reads, (C, k); dense (1, n), all of them."""
+        return y[None, :] if self.unknowns is None else y[self.unknowns]
+
+    def rows(self, pairs: np.ndarray) -> ContactNormals:
+        """Return the operator of some of the pairs, their numbers (P,) int."""
+        unknowns = None if self.unknowns is None else take_rows(self.unknowns, pairs)
+        return ContactNormals(take_rows(self.weights, pairs), unknowns, self.size)
+
+    @in_full_precision
     def transposed_product(self, multiplier: Array, size: int) -> Array:
         """Return N^T multiplier, (size,), for a multiplier (C,)."""
+        if self.unknowns is None:
+            return multiplier @ self.weights
         contributions = self.weights * multiplier[:, None]
         return jnp.zeros(size, contributions.dtype).at[self.unknowns].add(contributions)
 
@@ -190,6 +207,8 @@ class ContactNormals:
         Raises:
             ValueError: if the number of unknowns is given neither here nor in `size`.
         """
+        if self.unknowns is None:
+            return scipy.sparse.csr_array(np.asarray(self.weights))
         n_columns = self.size if size is None else size
         if n_columns is None:
             raise ValueError("this operator does not know its number of unknowns: pass to_scipy(n)")

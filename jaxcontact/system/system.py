@@ -8,6 +8,7 @@ on the n unknowns: the displacement components of the nodes that are not clamped
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +16,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.scene import (
-    Scene,
-    cellwise_material,
-    check_scene,
-    clamped_numbers,
-    is_elastic,
-)
-from jaxcontact.system import assembly
-from jaxcontact.system.contact_pairs import contact_pairs
-from jaxcontact.system.parts import Parts, named_parts
-from jaxcontact.system.rollers import check_movable, hold_rows, roller_rows
+from jaxcontact.system.basis import Basis
+from jaxcontact.system.pair_set import PairSet, pair_numbers
+from jaxcontact.system.parts import Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
-from jaxcontact.transforms.traced import as_array
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Basis:
-    """The space of a reduced model: y = vectors q, with M-orthonormal vectors."""
-
-    vectors: Array
-    """Basis vectors, (n_full, n): displacement components of the free nodes."""
-
-    projector: Array
-    """M vectors, (n_full, n): q = projector^T y is the M-orthogonal projection."""
+from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.traced import as_array, take_rows
 
 
 @jax.tree_util.register_dataclass
@@ -49,7 +31,7 @@ class System:
     """The matrices of a scene; n unknowns, N nodes, C contact pairs, dimension d."""
 
     mass: ComponentwiseMatrix | SymmetricMatrix
-    """M, consistent mass matrix with density, (n, n) [kg]; dense in a reduced model."""
+    """M, consistent mass matrix with density, (n, n) [kg]; the identity in a reduced model."""
 
     stiffness: SymmetricMatrix
     """A, elastic stiffness matrix, (n, n) [N/m]."""
@@ -107,6 +89,9 @@ class System:
     basis: Basis | None = None
     """Space of a reduced model (see `reduce`); None is all displacement components."""
 
+    open_pairs: PairSet | None = None
+    """Pairs that are taken to stay open (see `with_pairs`); None is none."""
+
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
@@ -145,6 +130,46 @@ class System:
         rounding = jnp.maximum(self.gap_rounding, jax.lax.stop_gradient(own))
         return replace(self, gap=gap, gap_rounding=rounding)
 
+    def save(self, path: str | Path) -> None:
+        """Write the system to an .npz file, which `load_system` reads.
+
+        If the writing fails or is killed, a file that was there before is still there.
+
+        Raises:
+            ValueError: if the system is traced.
+            OSError: if the file cannot be written.
+        """
+        save_dataclass(path, self)
+
+    def with_pairs(self, pairs: ArrayLike) -> System:
+        """Return the system with contact on some of its pairs only; the others stay open.
+
+        A pair out of reach then costs no part of the contact problem. The motion is exact or
+        refused: `simulate` looks at the gap of the others in every step, and where one of them
+        would penetrate, that step has failed.
+
+        Args:
+            pairs: which pairs can touch: (C,) bool, for instance `system.gap < reach` or
+                `jnp.any(trajectory.active, axis=0)`, or their numbers; concrete.
+
+        Raises:
+            ValueError: if the pairs are traced or are not among those of the system.
+        """
+        kept = pair_numbers(pairs, self.normals.count)
+        rest = np.setdiff1d(np.arange(self.normals.count), kept)
+        return replace(
+            self,
+            normals=self.normals.rows(kept),
+            gap=take_rows(self.gap, kept),
+            gap_rounding=take_rows(self.gap_rounding, kept),
+            contact_nodes=take_rows(self.contact_nodes, kept),
+            contact_area=take_rows(self.contact_area, kept),
+            directions=take_rows(self.directions, kept),
+            parts=self.parts.with_pairs(kept),
+            basis=None if self.basis is None else self.basis.with_pairs(kept),
+            open_pairs=PairSet.of(self, rest, self.open_pairs),
+        )
+
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
         return _lift(self, x)
@@ -156,8 +181,14 @@ class System:
 
         Of a reduced model, the unknowns of the M-orthogonal projection.
         """
-        free = _free_components(self, y)
-        return free if self.basis is None else free @ self.basis.projector
+        free = self.free_components(y)
+        return free if self.basis is None else self.basis.restrict(free)
+
+    def free_components(self, y: Array) -> Array:
+        """Return the components (..., n_full) of the free nodes of a nodal field (..., N, d)."""
+        if self.is_clamped:
+            y = jnp.take(y, self.free_nodes, axis=-2, mode="clip")
+        return y.reshape(*y.shape[:-2], -1)
 
     @in_full_precision
     def control_load(self, control: Array) -> Array:
@@ -167,112 +198,8 @@ class System:
     @in_full_precision
     def nodal_load(self, forces: Array) -> Array:
         """Return the load (..., n) [N] of forces on the nodes (..., N, d) [N]."""
-        load = _free_components(self, forces)
+        load = self.free_components(forces)
         return load if self.basis is None else load @ self.basis.vectors
-
-
-@in_full_precision
-def discretize(scene: Scene, dtype=jnp.float64) -> System:
-    """Assemble the P1 system of a scene.
-
-    Traceable in material, obstacles, loads and node positions; the connectivity and the names
-    must be concrete. What cannot raise because it is traced makes the system NaN: a material out of
-    range, an inverted cell, an obstacle that is none.
-
-    Args:
-        scene: the scene.
-        dtype: floating point type, float64 or float32.
-
-    Returns:
-        The system, with n = d (number of nodes that are not clamped) unknowns.
-
-    Raises:
-        ValueError: if the scene is inconsistent (see `check_scene`) or leaves nothing to move.
-        RuntimeError: if float64 is asked for while JAX has it switched off.
-    """
-    dtype = jnp.dtype(dtype)
-    _check_dtype(dtype)
-    check_scene(scene)
-    mesh, dimension = scene.mesh, scene.mesh.dimension
-    points = jnp.asarray(mesh.points, dtype)
-    cells = np.asarray(mesh.cells)
-
-    clamped_set = clamped_numbers(scene)
-    is_free = clamped_set < 0
-    free_nodes = np.flatnonzero(is_free).astype(np.int32)
-    if free_nodes.size == 0:
-        raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
-    numbers = np.where(is_free, np.cumsum(is_free) - 1, -1)
-
-    pattern = assembly.node_pattern(cells, numbers)
-    all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
-    around = {name: assembly.neighbourhood(cells, mesh.facets[name]) for name in scene.clamped}
-    values = assembly.scene_values(
-        points,
-        cells,
-        cellwise_material(scene),
-        pattern,
-        all_nodes,
-        free_nodes,
-        None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
-        {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
-        around,
-        is_elastic=is_elastic(scene),
-    )
-    # Under jit too, what is concrete stays so and can be checked and compared.
-    with jax.ensure_compile_time_eval():
-        # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, as_array(mesh.points), clamped_set, dtype)
-        weights = jnp.asarray(pairs.row_weights(), dtype)
-        rollers = roller_rows(scene, as_array(mesh.points), numbers, dtype)
-    components = np.arange(dimension, dtype=np.int32)
-    rows = numbers[pairs.row_nodes].astype(np.int32)[:, :, None]
-    unknowns = (rows * dimension + components[None, None, :]).reshape(weights.shape)
-
-    normals = ContactNormals(weights, unknowns, dimension * free_nodes.size)
-    if rollers is not None:
-        normals = hold_rows(rollers, normals)
-        check_movable(scene, normals, pairs.nodes)
-
-    def on_free(values: Array) -> SymmetricMatrix:
-        return SymmetricMatrix(values, pattern.columns)
-
-    return System(
-        mass=ComponentwiseMatrix(on_free(values.mass), dimension),
-        stiffness=on_free(values.stiffness),
-        viscosity=None if values.viscosity is None else on_free(values.viscosity),
-        l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
-        nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=normals,
-        gap=jnp.asarray(pairs.gap, dtype),
-        gap_rounding=jnp.asarray(pairs.rounding, dtype),
-        load=values.load,
-        contact_nodes=pairs.nodes,
-        contact_area=jnp.asarray(pairs.area, dtype),
-        points=points,
-        free_nodes=free_nodes,
-        node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
-        directions=jnp.asarray(pairs.normals, dtype),
-        parts=named_parts(scene, pairs, around, values.clamped, dtype),
-        dimension=dimension,
-        rollers=rollers,
-    )
-
-
-def _check_dtype(dtype) -> None:
-    if dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
-    if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
-            "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
-        )
-
-
-def _free_components(system: System, y: Array) -> Array:
-    if system.is_clamped:
-        y = jnp.take(y, system.free_nodes, axis=-2, mode="clip")
-    return y.reshape(*y.shape[:-2], -1)
 
 
 @in_full_precision

@@ -6,7 +6,7 @@ then: multiplication carries the NaN into the derivatives too, where `jnp.where`
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,24 @@ def is_traced(tree: object) -> bool:
 def as_array(value: ArrayLike | list[Array]) -> Array | np.ndarray:
     """Return a number, an array or a list of numbers as an array, on the host if it is concrete."""
     return jnp.asarray(value) if is_traced(value) else np.asarray(value)
+
+
+def take_rows(values: Array | np.ndarray, numbers: np.ndarray) -> Any:
+    """Return values[numbers], concrete if the values are, also under jit."""
+    if is_traced(values):
+        return values[numbers]
+    with jax.ensure_compile_time_eval():
+        return values[numbers]
+
+
+def join_rows(first: Array | np.ndarray, second: Array | np.ndarray) -> Any:
+    """Return both arrays one after the other, concrete if both are, also under jit."""
+    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        return np.concatenate([first, second])
+    if is_traced((first, second)):
+        return jnp.concatenate([first, second])
+    with jax.ensure_compile_time_eval():
+        return jnp.concatenate([first, second])
 
 
 def poison_unless(condition: Array | bool, values: Tree) -> Tree:

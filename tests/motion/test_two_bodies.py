@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.two_bodies import RUBBER, rigid_motions, round_bodies, stacked, touching
+from support.two_bodies import RUBBER, momenta, round_bodies, stacked, thrown, touching
 
 import jaxcontact as jc
 
@@ -12,21 +12,6 @@ SCHEMES = [jc.ContactImplicit(), jc.ContactStabilized(), jc.BackwardEuler()]
 # Momentum and energy: some hundred steps of some hundred sums.
 KEPT = 1e-12
 SPEED = 0.1
-
-
-def thrown(scene, body, velocity):
-    """The state in which one body of a joined mesh moves, and everything else rests"""
-    nodes = np.unique(scene.mesh.cells[scene.mesh.regions[body]])
-    rest = jnp.zeros(scene.mesh.points.shape)
-    return jc.State(rest, rest.at[nodes].set(jnp.asarray(velocity)))
-
-
-def momenta(system, motion, points):
-    """Momenta and angular momenta of every state, (T+1, k)"""
-    mass = system.mass.scalar.to_scipy()
-    fields = np.asarray(rigid_motions(points))
-    weighted = np.stack([mass @ field for field in fields])
-    return np.einsum("kni,tni->tk", weighted, motion.velocity)
 
 
 def body_velocities(scene, system, velocity):
@@ -213,21 +198,6 @@ def test_trapezoidal_keeps_the_momentum_of_two_bodies():
     assert np.any(motion.active)
     kept = momenta(system, motion, scene.mesh.points)
     assert np.max(np.abs(kept - kept[0])) < KEPT * np.max(np.abs(kept[0]))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"scheme": jc.RedistributedMass()},
-            "contact between two bodies; use jc.ContactStabilized",
-        ),
-        ({"linear_solver": jc.ConjugateGradient()}, "not other bodies; use .*NestedDissection"),
-    ],
-)
-def test_what_does_not_know_two_bodies_says_so(blocks, options, message):
-    with pytest.raises(ValueError, match=message):
-        jc.prepare(blocks, 0.05, **options)
 
 
 def test_bodies_that_penetrate_at_the_start_are_refused():

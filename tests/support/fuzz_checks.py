@@ -54,13 +54,10 @@ class Report:
 
 
 def is_coarse(kind, out):
-    """Whether the redistributed mass is indefinite, (B,): refused, but not where it is traced"""
-    mass = np.asarray(out["mass"], float)
-    mass = np.where(np.isfinite(mass), mass, 0.0)
-    if not isinstance(kind.scheme, jc.RedistributedMass):
-        return np.zeros(len(mass), bool)
-    values = np.linalg.eigvalsh(mass)
-    return values[:, 0] < -500.0 * np.finfo(kind.dtype).eps * values[:, -1]
+    """Whether the redistributed mass is indefinite, (B,): it is refused, and NaN where traced"""
+    mass = np.asarray(out["mass"])
+    is_nan = np.isnan(mass).any(axis=(1, 2))
+    return is_nan & isinstance(kind.scheme, jc.RedistributedMass)
 
 
 def _may_fail(kind, failed):

@@ -73,3 +73,18 @@ def rigid_motions(points):
             turn[i, j], turn[j, i] = 1.0, -1.0
             fields.append(points @ turn)
     return jnp.asarray(np.stack(fields))
+
+
+def thrown(scene, body, velocity):
+    """The state in which one body of a joined mesh moves, and everything else rests"""
+    nodes = np.unique(scene.mesh.cells[scene.mesh.regions[body]])
+    rest = jnp.zeros(scene.mesh.points.shape)
+    return jc.State(rest, rest.at[nodes].set(jnp.asarray(velocity)))
+
+
+def momenta(system, motion, points):
+    """Momenta and angular momenta of every state, (T+1, k)"""
+    mass = system.mass.scalar.to_scipy()
+    fields = np.asarray(rigid_motions(points))
+    weighted = np.stack([mass @ field for field in fields])
+    return np.einsum("kni,tni->tk", weighted, motion.velocity)

@@ -144,7 +144,7 @@ class NestedDissection:
             ValueError: if the matrix is dense, or its pattern, `normals.unknowns` or the
                 coordinates are traced.
         """
-        if matrix.columns is None:
+        if matrix.columns is None or normals.unknowns is None:
             raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         columns = unknown_columns(matrix.columns, matrix.values.shape[1])
         plan = plan_for(columns, normals.unknowns, coordinates, self.leaf_size)
