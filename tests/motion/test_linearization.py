@@ -73,7 +73,7 @@ def test_turned_plane_is_where_it_has_turned_to():
     plane = jc.HalfSpace(np.array([0.0, -0.1]), UP)
     wall = jc.HalfSpace(np.array([-0.2, 0.0]), np.array([1.0, 0.0]))
     scene = jc.Scene(BLOCK, VISCOUS, contact={"bottom": plane, "left": wall})
-    angles = jnp.linspace(0.0, 0.1, STEPS + 1)
+    angles = jnp.linspace(0.0, -0.1, STEPS + 1)
     about, shift = np.array([2.0, -0.1]), np.array([0.0, 0.03])
 
     def gaps(angles):

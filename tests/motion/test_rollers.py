@@ -11,8 +11,8 @@ from support.bodies import SCHEMES
 from support.thrown_bodies import DT, MESHES, STEPS, cost, initial_of, parameters, up
 
 import jaxcontact as jc
+from jaxcontact.system.basis import Basis
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
-from jaxcontact.system.system import Basis
 
 RUBBER = jc.KelvinVoigt(young=1.0, poisson=0.3)
 SLANTED = {2: np.array([1.0, 0.5]), 3: np.array([1.0, -0.3, 0.2])}
@@ -69,7 +69,13 @@ def eliminated(system, Q):
         l2_mass=dense(system.l2_mass),
         normals=ContactNormals(rows, unknowns, Q.shape[1]),
         load=system.load @ Q,
-        basis=Basis(jnp.asarray(Q), jnp.asarray(Q)),
+        basis=Basis(
+            jnp.asarray(Q),
+            SymmetricMatrix(jnp.eye(len(Q)), None),
+            system.normals,
+            np.arange(system.normals.count),
+            modes=0,
+        ),
     )
 
 
