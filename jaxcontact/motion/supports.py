@@ -16,7 +16,7 @@ of all nodes, with the work of the supports
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jax import Array
 
 from jaxcontact.schemes import Scheme, StepState
 from jaxcontact.schemes.interface import force_of_step
+from jaxcontact.system.assembly import hat_gradients, mass_blocks, stiffness_blocks
 from jaxcontact.system.parts import ClampedSet
 from jaxcontact.system.system import System
 
@@ -92,25 +93,44 @@ def moves_of(displacement: Array, dt: Array) -> Moves:
 
 def support_shapes(system: System, sets: list[ClampedSet]) -> SupportShapes:
     """Return the forces that the moves of clamped sets exert."""
-    couple = partial(_coupling, system, sets)
-    viscosity = [moved.forces.viscosity for moved in sets if moved.forces.viscosity is not None]
-    identity = jnp.eye(system.dimension, dtype=system.dtype)[None]
+    forces = [_set_forces(system, moved) for moved in sets]
+    stiffness, viscosity, inertia = zip(*forces, strict=True)
+    has_viscosity = system.viscosity is not None
     return SupportShapes(
-        couple([moved.forces.stiffness for moved in sets]),
-        couple(viscosity) if viscosity else None,
-        couple([moved.forces.mass[:, None, None] * identity for moved in sets]),
+        _coupling(system, sets, stiffness),
+        _coupling(system, sets, viscosity) if has_viscosity else None,
+        _coupling(system, sets, inertia),
     )
 
 
-def _coupling(system: System, sets: list[ClampedSet], forces: list[Array]) -> Coupling:
-    """Return the coupling by forces (m, d, d) on the nodes around each set."""
-    d = system.dimension
-    empty = jnp.zeros((system.n_nodes, d, d), system.dtype)
-    fields = [
-        empty.at[moved.around].add(force).transpose(2, 0, 1)  # (axis, N, i)
-        for moved, force in zip(sets, forces, strict=True)
-    ]
-    moves = jnp.concatenate(fields)
+def _set_forces(system: System, moved: ClampedSet) -> tuple[Array, Array, Array]:
+    """Return the forces (d, N, d) per displacement, velocity and acceleration of a set.
+
+    Entry k is the force on all nodes when it moves along axis k: the matrices of the cells that
+    touch the set, assembled over the columns of its nodes.
+    """
+    d, n_nodes, dtype = system.dimension, system.n_nodes, system.dtype
+    cells, material = jnp.asarray(moved.cells), moved.material
+    gradients, volumes = hat_gradients(system.points, cells)
+    in_set = jnp.zeros(n_nodes, dtype).at[moved.nodes].set(1.0)[cells]
+
+    def assembled(blocks: Array) -> Array:
+        forces = jnp.einsum("eabij,eb->eaij", blocks, in_set)
+        return jnp.zeros((n_nodes, d, d), dtype).at[cells].add(forces).transpose(2, 0, 1)
+
+    elastic, viscous = material.elastic_lame(), material.viscous_lame()
+    density = jnp.broadcast_to(jnp.asarray(material.density, dtype), volumes.shape)
+    mass = density[:, None, None, None, None] * mass_blocks(volumes, d)
+    return (
+        assembled(stiffness_blocks(gradients, volumes, elastic)),
+        assembled(stiffness_blocks(gradients, volumes, viscous)),
+        assembled(mass * jnp.eye(d, dtype=dtype)[None, None, None]),
+    )
+
+
+def _coupling(system: System, sets: list[ClampedSet], forces: Sequence[Array]) -> Coupling:
+    """Return the coupling by the forces (d, N, d) of each set."""
+    moves = jnp.concatenate(forces)
     inside = [jnp.sum(moves[:, moved.nodes], axis=1) for moved in sets]
     return Coupling(system.nodal_load(moves), jnp.concatenate(inside, axis=1))
 

@@ -13,7 +13,6 @@ comments: e cell, a b local node, i j component.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -138,54 +137,6 @@ def nodal_areas(points: Array, facets: Array | np.ndarray) -> Array:
     return jnp.zeros(points.shape[0], points.dtype).at[jnp.ravel(facets)].add(shares)
 
 
-class Neighbourhood(NamedTuple):
-    """The cells around a set of nodes, z of them with m nodes (host arrays)."""
-
-    nodes: np.ndarray
-    """All nodes of the cells, (m,) int32."""
-
-    cells: np.ndarray
-    """The cells, (z,) int32."""
-
-    corners: np.ndarray
-    """Place of their corners in `nodes`, (z, d+1) int32."""
-
-    in_set: np.ndarray
-    """Whether a corner is in the set, (z, d+1) bool."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class SetForces:
-    """Forces on the nodes around a set that moves as a whole; column j for a move along axis j."""
-
-    mass: Array
-    """Per acceleration, along it, (m,) [kg]."""
-
-    stiffness: Array
-    """Per displacement, (m, d, d) [N/m]."""
-
-    viscosity: Array | None
-    """Per velocity, (m, d, d) [N s/m]; None without viscosity."""
-
-
-def neighbourhood(cells: np.ndarray, nodes: np.ndarray) -> Neighbourhood:
-    """Return the cells (E, d+1) that have a corner in a set of nodes."""
-    in_set = np.isin(cells, nodes)
-    near = np.flatnonzero(np.any(in_set, axis=1)).astype(np.int32)
-    around, corners = np.unique(cells[near], return_inverse=True)
-    corners = corners.reshape(cells[near].shape).astype(np.int32)
-    return Neighbourhood(around.astype(np.int32), near, corners, in_set[near])
-
-
-def _set_forces(around: Neighbourhood, blocks: Array) -> Array:
-    """Return sums (m, c, c) of the element matrices (E, a, b, c, c) over the columns of a set."""
-    columns = around.in_set.astype(blocks.dtype)
-    forces = jnp.einsum("zabij,zb->zaij", blocks[around.cells], columns)
-    sums = jnp.zeros((around.nodes.shape[0], *blocks.shape[3:]), blocks.dtype)
-    return sums.at[around.corners].add(forces)
-
-
 class SceneValues(NamedTuple):
     """Entries of the matrices in ELL layout, those of the masses scalar; load (n,)."""
 
@@ -195,7 +146,6 @@ class SceneValues(NamedTuple):
     l2_mass: Array
     nodal_mass: Array
     load: Array
-    clamped: dict[str, SetForces]
 
 
 # One program for all of it: compiling operation by operation takes seconds for every new mesh.
@@ -209,7 +159,6 @@ def scene_values(
     free_nodes: Array,
     body_force: Array | None,
     tractions: dict[str, tuple[Array, Array]],
-    clamped: dict[str, Neighbourhood],
     *,
     is_elastic: bool,
 ) -> SceneValues:
@@ -224,7 +173,6 @@ def scene_values(
         free_nodes: the nodes whose displacement components are the unknowns, (n/d,).
         body_force: (d,) [N/m^d], or None.
         tractions: facets (F, d) and traction (d,) [N/m^(d-1)] of each loaded set.
-        clamped: the cells around each clamped set.
         is_elastic: whether there is no viscosity.
     """
     dimension = points.shape[1]
@@ -232,11 +180,9 @@ def scene_values(
     l2_blocks = mass_blocks(volumes, dimension)
     density = jnp.broadcast_to(jnp.asarray(material.density, points.dtype), volumes.shape)
 
-    mass = density[:, None, None, None, None] * l2_blocks
-    stiffness = stiffness_blocks(gradients, volumes, material.elastic_lame())
-    viscosity = None
-    if not is_elastic:
-        viscosity = stiffness_blocks(gradients, volumes, material.viscous_lame())
+    def isotropic(lame: tuple) -> Array:
+        blocks = stiffness_blocks(gradients, volumes, lame)
+        return assemble(pattern, blocks)
 
     load = jnp.zeros(points.shape, points.dtype)
     if body_force is not None:
@@ -246,20 +192,12 @@ def scene_values(
     for facets, traction in tractions.values():
         load = load + nodal_areas(points, facets)[:, None] * traction[None, :]
     values = SceneValues(
-        mass=assemble(pattern, mass),
-        stiffness=assemble(pattern, stiffness),
-        viscosity=None if viscosity is None else assemble(pattern, viscosity),
+        mass=assemble(pattern, density[:, None, None, None, None] * l2_blocks),
+        stiffness=isotropic(material.elastic_lame()),
+        viscosity=None if is_elastic else isotropic(material.viscous_lame()),
         l2_mass=assemble(pattern, l2_blocks),
         nodal_mass=assemble(all_nodes, l2_blocks),
         load=load[free_nodes].reshape(-1),
-        clamped={
-            name: SetForces(
-                _set_forces(around, mass)[:, 0, 0],
-                _set_forces(around, stiffness),
-                None if viscosity is None else _set_forces(around, viscosity),
-            )
-            for name, around in clamped.items()
-        },
     )
     # Concrete values were checked before; traced ones cannot raise.
     return poison_unless(is_admissible(material) & jnp.all(volumes > 0.0), values)

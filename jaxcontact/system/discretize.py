@@ -59,17 +59,16 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
 
     pattern = assembly.node_pattern(cells, numbers)
     all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
-    around = {name: assembly.neighbourhood(cells, mesh.facets[name]) for name in scene.clamped}
+    material = cellwise_material(scene)
     values = assembly.scene_values(
         points,
         cells,
-        cellwise_material(scene),
+        material,
         pattern,
         all_nodes,
         free_nodes,
         None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
         {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
-        around,
         is_elastic=is_elastic(scene),
     )
     # Under jit too, what is concrete stays so and can be checked and compared.
@@ -106,7 +105,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         free_nodes=free_nodes,
         node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
         directions=jnp.asarray(pairs.normals, dtype),
-        parts=named_parts(scene, pairs, around, values.clamped, dtype),
+        parts=named_parts(scene, pairs, material, dtype),
         dimension=dimension,
         rollers=rollers,
     )

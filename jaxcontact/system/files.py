@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxcontact.system.assembly import SetForces
+from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.system.basis import Basis
 from jaxcontact.system.pair_set import PairSet
 from jaxcontact.system.parts import ClampedSet, Parts
@@ -22,4 +22,4 @@ def load_system(path: str | Path) -> System:
         RuntimeError: if the system is in float64 while JAX has it switched off.
     """
     matrices = (ComponentwiseMatrix, ContactNormals, SymmetricMatrix)
-    return load_dataclass(path, (System, Basis, PairSet, Parts, ClampedSet, SetForces, *matrices))
+    return load_dataclass(path, (System, Basis, PairSet, Parts, ClampedSet, KelvinVoigt, *matrices))

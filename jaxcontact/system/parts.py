@@ -14,25 +14,25 @@ from jax import Array
 
 from jaxcontact.scene.cells import end_signs
 from jaxcontact.scene.facets import Facets
+from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.scene import Scene
-from jaxcontact.system.assembly import Neighbourhood, SetForces
 from jaxcontact.system.pairs import ContactPairs
-from jaxcontact.transforms.traced import take_rows
+from jaxcontact.transforms.traced import as_array, take_rows
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ClampedSet:
-    """A clamped facet set: what the rest of the scene feels when it moves as a whole."""
+    """A clamped facet set, and the cells through which the other nodes feel it move."""
 
     nodes: np.ndarray
     """Nodes of the set, (k,) int32."""
 
-    around: np.ndarray
-    """All nodes of the cells that touch the set, (m,) int32."""
+    cells: np.ndarray
+    """Nodes of the z cells that touch the set, (z, d+1) int32."""
 
-    forces: SetForces
-    """Forces on these nodes."""
+    material: KelvinVoigt
+    """Material of these cells, its values scalars or (z,)."""
 
     is_alone: np.ndarray
     """Whether no node is in another clamped set too, () bool; else it cannot move by itself."""
@@ -72,8 +72,7 @@ class Parts:
 def named_parts(
     scene: Scene,
     pairs: ContactPairs,
-    around: dict[str, Neighbourhood],
-    forces: dict[str, SetForces],
+    material: KelvinVoigt,
     dtype: np.dtype,
 ) -> Parts:
     """Return the named parts of a scene.
@@ -81,8 +80,7 @@ def named_parts(
     Args:
         scene: the scene.
         pairs: its contact pairs.
-        around: the cells around each clamped set.
-        forces: on the nodes of these cells.
+        material: its values scalars, or one for each cell (E,).
         dtype: type of the values.
     """
     mesh = scene.mesh
@@ -97,11 +95,17 @@ def named_parts(
     for number, name in enumerate(scene.clamped):
         others = [nodes for other, nodes in sets.items() if other != name]
         shared = np.intersect1d(sets[name], np.concatenate(others)) if others else np.zeros(0)
+        touching = np.flatnonzero(np.any(np.isin(mesh.cells, sets[name]), axis=1))
         clamped[name] = ClampedSet(
             nodes=sets[name],
-            around=around[name].nodes,
-            forces=forces[name],
+            cells=np.asarray(mesh.cells)[touching],
+            material=_of_cells(material, touching),
             is_alone=np.asarray(shared.size == 0),
             shares=jnp.asarray(pairs.held[:, number], dtype),
         )
     return Parts(dict(mesh.facets), end_signs(mesh.cells), obstacles, clamped)
+
+
+def _of_cells(material: KelvinVoigt, cells: np.ndarray) -> KelvinVoigt:
+    """Return the material of some cells, from scalars or from the values of all cells (E,)."""
+    return jax.tree.map(lambda x: x if np.ndim(x) == 0 else take_rows(as_array(x), cells), material)
