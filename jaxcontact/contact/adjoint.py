@@ -99,7 +99,7 @@ def _solve_fwd(*arguments):
         weights=weights,
         compliance=compliance,
         # What changes from step to step and is not needed again.
-        fixed=fixed._replace(resolution=None, guess=None, is_open=None),
+        fixed=fixed._replace(resolution=None, guess=None, is_open=None, closed=None),
     )
     return (w, solution), residuals
 

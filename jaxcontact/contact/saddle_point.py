@@ -42,6 +42,9 @@ class Fixed(NamedTuple):
     is_open: Array | None
     """Pairs that are open in the derivative whatever their state, (C,) bool; None is none."""
 
+    closed: Array | None = None
+    """The pairs that are closed in motion and derivative, (C,) bool; None lets contact decide."""
+
 
 def solve_on_cone(
     values: Array,

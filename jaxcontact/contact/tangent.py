@@ -20,7 +20,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from jaxcontact.contact import critical_cone
-from jaxcontact.contact.complementarity import Solution
+from jaxcontact.contact.complementarity import Guess, Solution, Status
 from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.contact.weak import WeakContact
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
@@ -46,9 +46,12 @@ def _solve_forward(
     fixed: Fixed,
 ) -> tuple[Array, Solution]:
     """Solve the VI; see `ContactProblem.solve`."""
-    del weak_contact, values, weights, compliance
+    del weak_contact, compliance
     assert fixed.resolution is not None
     assert fixed.guess is not None
+    if fixed.closed is not None:
+        w, p = solve_on_cone(values, weights, fixed, fixed.closed, None, rhs, bound)
+        return w, _on_pattern(fixed.closed, fixed.guess, p)
     return fixed.form.solve(rhs, bound, fixed.resolution, fixed.guess)
 
 
@@ -80,6 +83,8 @@ def linear_contact(
 ) -> tuple[Array, Array | None]:
     """Return the pairs (C,) bool and the softness (C,) or None of the linearised contact law."""
     contact_solver = fixed.form.contact_solver
+    if fixed.closed is not None:
+        return _not_open(fixed, fixed.closed), None
     if contact_solver.is_exact:
         return _not_open(fixed, weak_contact.equality_set(solution)), None
     softness = contact_solver.softness(compliance, solution.multiplier)
@@ -91,6 +96,14 @@ def linear_contact(
 def by_compliance(compliance: Array, softness: Array, multiplier: Array) -> Array:
     """Return -dg/dd of a law g(d p), (C,), from s = -dg/dp: s p / d."""
     return softness * multiplier / compliance
+
+
+def _on_pattern(closed: Array, guess: Guess, multiplier: Array) -> Solution:
+    """Return the solution for given closed pairs; nothing is iterated, no sign is asked for."""
+    is_finite = jnp.all(jnp.isfinite(multiplier))
+    status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
+    nothing = jnp.zeros((), multiplier.dtype)
+    return Solution(multiplier, closed, jnp.int32(0), status, nothing, guess.workspace)
 
 
 def _not_open(fixed: Fixed, pairs: Array) -> Array:

@@ -65,6 +65,10 @@ class Perturbation(NamedTuple):
     is_open: Array | None = None
     """Pairs that are open in the derivative, whatever their state, (C,) bool."""
 
+    closed: Array | None = None
+    """The pairs that keep contact, whatever the signs, (C,) bool: they are closed and all others
+    are open, so that the solution is affine in r and b. None lets the solver find them."""
+
 
 #: The contact problem itself.
 NO_PERTURBATION = Perturbation()
@@ -122,12 +126,18 @@ class ContactProblem:
         rhs = hold(self.rollers, rhs)
         if self.normals.count == 0:
             return self._solve_without_contact(rhs, bound, guess)
-        shift, push, is_open = self.perturbation
+        shift, push, is_open, closed = self.perturbation
         value = bound.value if shift is None else bound.value + shift
         if push is not None:
             rhs = rhs - self.normals.transposed_product(push, rhs.shape[0])
         fixed = Fixed(
-            self.matrix.columns, self.normals.unknowns, self.form, bound.resolution, guess, is_open
+            self.matrix.columns,
+            self.normals.unknowns,
+            self.form,
+            bound.resolution,
+            guess,
+            is_open,
+            closed,
         )
         data = (self.matrix.values, self.normals.weights, rhs, value, self.compliance, fixed)
         if self.weak_contact is None:

@@ -18,17 +18,23 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.control.inner_product import nodal_norms
+from jaxcontact.control.distance import NodalDistance, ReducedDistance, reduced_distance
 from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.assembly import nodal_areas
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.control_space import as_columns
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 
 
+@jax.tree_util.register_pytree_node_class
 class TrackingCost:
-    """Tracking-type cost functional, a function of trajectory and control."""
+    """Tracking-type cost functional, a function of trajectory and control; a pytree.
+
+    For a reduced system it is computed in its unknowns, for a control (T, n) without any array of
+    the size of the mesh.
+    """
 
     def __init__(
         self,
@@ -45,7 +51,7 @@ class TrackingCost:
 
         Args:
             system: the discretised scene.
-            target: desired displacement y_d, (T+1, N, d) [m].
+            target: desired displacement y_d, (T+1, N, d) [m], or unknowns (T+1, n).
             dt: length of a time step tau, [s]; default that of the trajectory.
             control_weight: Tychonoff parameter alpha.
             final_weight: weight gamma of the final-time observation.
@@ -54,19 +60,22 @@ class TrackingCost:
             nodes: node numbers (R,): track these nodes, in the Euclidean norm, not the body.
 
         Raises:
-            ValueError: if the target does not have the shape (T+1, N, d), if facets or nodes are
-                not in the mesh, or if both are given.
+            ValueError: if the target has another shape, if facets or nodes are not in the mesh, or
+                if both are given.
         """
-        shape = (system.n_nodes, system.dimension)
-        if np.ndim(target) != 3 or np.shape(target)[1:] != shape:
+        nodal = (system.n_nodes, system.dimension)
+        if np.shape(target)[1:] == (system.size,):
+            target = system.lift(jnp.asarray(target, system.dtype))
+        if np.shape(target)[1:] != nodal:
             raise ValueError(
-                f"target must have shape (T+1, N, d) = (T+1, {shape[0]}, {shape[1]}), got "
-                f"{np.shape(target)}"
+                f"target must have shape (T+1, N, d) = (T+1, {nodal[0]}, {nodal[1]}) or, in "
+                f"unknowns, (T+1, n) = (T+1, {system.size}), got {np.shape(target)}"
             )
-        self.nodal_mass = system.nodal_mass
-        self.observation = _observation(system, facets, nodes)
+        weights = _node_weights(system, facets, nodes)
+        self.masses = (system.nodal_mass, system.l2_mass)
+        self.distance = NodalDistance(system.nodal_mass, weights, target)
+        self.reduced = None if system.basis is None else reduced_distance(system, self.distance)
         self.dt = dt
-        self.target = target
         self.control_weight = control_weight
         self.final_weight = final_weight
 
@@ -75,9 +84,9 @@ class TrackingCost:
         """Return the value of the functional, a scalar.
 
         Args:
-            trajectory: states of T steps.
-            control: the control that is penalised, (T, N, d), before any scaling; None if there
-                is none.
+            trajectory: states of T steps, of this system or of another model on its mesh.
+            control: the control that is penalised, (T, N, d) or (T, n), before any scaling; None
+                if there is none.
 
         Raises:
             ValueError: if the trajectory or the control does not have the T steps of the target,
@@ -85,52 +94,64 @@ class TrackingCost:
                 NaN instead).
         """
         check_every_step(trajectory)
-        steps = np.shape(self.target)[0] - 1
-        if np.shape(trajectory.displacement) != np.shape(self.target):
+        levels, *nodal = np.shape(self.distance.target)
+        # The unknowns know nothing of supports that a schedule moves.
+        is_moved = trajectory.schedule is not None and bool(trajectory.schedule.motion)
+        is_reduced = self.reduced is not None and self.reduced.fits(trajectory.unknowns)
+        is_reduced = is_reduced and not is_moved
+        motion = trajectory.unknowns if is_reduced else trajectory.displacement
+        if np.shape(motion)[0] != levels or not (is_reduced or np.shape(motion)[1:] == (*nodal,)):
             raise ValueError(
-                f"the trajectory has displacements {np.shape(trajectory.displacement)}, the "
-                f"target {np.shape(self.target)}; both must hold the same T+1 time levels"
+                f"the trajectory has displacements {np.shape(trajectory.displacement)}, the target "
+                f"{(levels, *nodal)}; both must hold the same T+1 time levels"
             )
-        if control is not None and np.shape(control) != (steps, *np.shape(self.target)[1:]):
+        shapes = ((levels - 1, *nodal), (levels - 1, self.masses[1].size))
+        if control is not None and np.shape(control) not in shapes:
             raise ValueError(
-                f"control must have shape {(steps, *np.shape(self.target)[1:])}, got "
-                f"{np.shape(control)}"
+                f"control must have shape {shapes[0]} or {shapes[1]}, got {np.shape(control)}"
             )
         return _tracking_cost(
-            self.nodal_mass,
-            self.observation,
+            self.reduced if is_reduced else self.distance,
             _step_length(trajectory, self.dt),
-            self.target,
             self.control_weight,
             self.final_weight,
-            trajectory.displacement,
+            motion,
+            None if control is None else self.masses[np.ndim(control) == 2],
             control,
         )
+
+    def tree_flatten(self) -> tuple[list, tuple[str, ...]]:
+        """Return the fields and their names."""
+        return list(vars(self).values()), tuple(vars(self))
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values) -> TrackingCost:
+        """Return the functional of the fields."""
+        cost = object.__new__(cls)
+        vars(cost).update(zip(names, values, strict=True))
+        return cost
 
 
 # Under jit with the arrays as arguments: nothing large is baked into a compiled program.
 @jax.jit
 def _tracking_cost(
-    nodal_mass: SymmetricMatrix,
-    observation: Array | None,
+    distance: NodalDistance | ReducedDistance,
     dt: Array,
-    target: Array,
     control_weight: Array,
     final_weight: Array,
-    displacement: Array,
+    motion: Array,
+    mass: SymmetricMatrix | ComponentwiseMatrix | None,
     control: Array | None,
 ) -> Array:
-    if observation is None:
-        errors = nodal_norms(nodal_mass, displacement - target)
-    else:
-        errors = jnp.einsum("n,tni->t", observation, (displacement - target) ** 2)
+    errors = distance.squares(motion)
     cost = 0.25 * dt * jnp.sum(errors[:-1] + errors[1:]) + final_weight * errors[-1]
-    if control is not None:
-        cost = cost + 0.5 * control_weight * dt * jnp.sum(nodal_norms(nodal_mass, control))
+    if mass is not None and control is not None:
+        columns = as_columns(control)
+        cost = cost + 0.5 * control_weight * dt * jnp.sum(columns * (mass @ columns))
     return cost
 
 
-def _observation(
+def _node_weights(
     system: System, facets: np.ndarray | None, nodes: np.ndarray | None
 ) -> Array | None:
     """Return the weight of each node, (N,); None is the L2 norm of the body."""

@@ -35,7 +35,7 @@ class ControlMap(Protocol):
     """Linear map from parameters to controls, a pytree; for instance an `Actuator`."""
 
     def __call__(self, parameters: Array) -> Array:
-        """Return the control (T, N, d)."""
+        """Return the control (T, N, d) or (T, n)."""
         ...
 
     def inner_product(
@@ -69,7 +69,13 @@ class Counts:
     """Evaluations of value and gradient."""
 
     hessian_products: int = 0
-    """Products with the Hessian."""
+    """Products with the Hessian; to linearise the motion for them counts as one."""
+
+    rows: int = 0
+    """Derivatives of the gap of one pair in one step."""
+
+    motions: int = 0
+    """Simulations without a derivative."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,11 @@ class Problem:
             )
         product = inner_product
         if product is None:
+            if bounds is not None and controls is None and start.ndim == 2:
+                raise ValueError(
+                    "bounds are those of nodal values, and a control in unknowns (T, n) has none; "
+                    "optimise the control (T, N, d), or hand over an inner_product"
+                )
             product = _product_of(system, dt, controls, is_bounded=bounds is not None)
         check_option(
             "inner_product", product, InnerProduct, "control.inner_product.Weighted(weights)"
@@ -154,11 +165,21 @@ class Problem:
         value = jnp.where(is_finite, value, jnp.inf)
         return Point(parameters, value, derivative, gradient)
 
-    def hessian_product(self, parameters: Array, direction: Array) -> Array:
-        """Return the Hessian (one of a semismooth J) times a direction, a covector."""
+    def hessian(self, parameters: Array) -> Callable[[Array], Array]:
+        """Return the Hessian (one of a semismooth J): maps a direction to a covector.
+
+        The motion is linearised once, so that a product is one sweep forward and one back.
+        """
         self.counts.hessian_products += 1
-        multiply = _hessian_product_compiled if self.is_compiled else _hessian_product
-        return multiply(self.objective, self.controls, parameters, direction)
+        linearize = _linearized_gradient_compiled if self.is_compiled else _linearized_gradient
+        linear = linearize(self.objective, self.controls, parameters)
+        apply = _apply_compiled if self.is_compiled else _apply
+
+        def product(direction: Array) -> Array:
+            self.counts.hessian_products += 1
+            return apply(linear, direction)
+
+        return product
 
     def riesz(self, covector: Array) -> Array:
         """Return the vector that represents a covector."""
@@ -211,9 +232,12 @@ def _evaluate(objective, controls, product, parameters):
     return value, derivative, gradient, is_finite
 
 
-def _hessian_product(objective, controls, parameters, direction):
-    derivative = jax.grad(lambda p: objective(controls(p)))
-    return jax.jvp(derivative, (parameters,), (direction,))[1]
+def _linearized_gradient(objective, controls, parameters):
+    return jax.linearize(jax.grad(lambda p: objective(controls(p))), parameters)[1]
+
+
+def _apply(linear, direction):
+    return linear(direction)
 
 
 @jax.jit
@@ -228,4 +252,5 @@ def _riesz(product, covector):
 
 # Module-level, so that a second optimisation of the same problem compiles nothing.
 _evaluate_compiled = jax.jit(_evaluate)
-_hessian_product_compiled = jax.jit(_hessian_product)
+_linearized_gradient_compiled = jax.jit(_linearized_gradient)
+_apply_compiled = jax.jit(_apply)

@@ -2,15 +2,15 @@
 
 The matrix of a time step is well conditioned while c tau / h is about one, so that a few dozen
 iterations suffice. Contact cannot be condensed here (that takes one solve per contact pair);
-instead a fixed active set A is eliminated by the projection P = I - N_A^T N_A, which is local
-because every contact pair has a node of its own:
+instead a fixed active set A is eliminated by the projection P = I - N_A^T G^-1 N_A M^-1 with
+G = N_A M^-1 N_A^T and the diagonal M of D, of forces, and its transpose of velocities:
 
-    w = N_A^T b_A + z,   P D P z = P (r - D N_A^T b_A),   p_A = N_A (r - D w).
+    w = M^-1 N_A^T G^-1 b_A + z,   P D z = P (r - D w + D z),   p_A = G^-1 N_A M^-1 (r - D w).
 
-The preconditioner M^-1 has one number per node, so that it commutes with P. Velocities have the
-norm |w| = sqrt(w^T M w), residuals |r| = sqrt(r^T M^-1 r). With m, the smallest eigenvalue of
-M^-1 D, which P does not lower, the error |w - exact w| is at most |P (r - D w)| / m: the iteration
-goes on until this is small, and a solve that cannot get there gives NaN.
+Velocities have the norm |w| = sqrt(w^T M w), residuals |r| = sqrt(r^T M^-1 r), in which P is
+orthogonal. With m, the smallest eigenvalue of M^-1 D, which P does not lower, the error
+|w - exact w| is at most |P (r - D w)| / m: the iteration goes on until this is small, and a solve
+that cannot get there gives NaN.
 
 Source: Gould, Hribar, Nocedal, SIAM J. Sci. Comput. 23 (2001).
 """
@@ -25,6 +25,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jaxcontact.linear.pair_gram import PairGram, pair_gram
 from jaxcontact.linear.projected_iteration import iterate
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
@@ -46,7 +47,7 @@ class IterativeFactor:
     """A matrix that is solved with by iteration: nothing is factorised.
 
     A result is NaN if the iteration did not end or if the estimated error of w exceeds
-    sqrt(tolerance) (|w| + |r| + |N_A^T b_A|), 1e-6 for the default tolerance. float64 attains that
+    sqrt(tolerance) (|w| + |r| + |lifted b_A|), 1e-6 for the default tolerance. float64 attains that
     up to a condition of M^-1 D of about 1e9.
     """
 
@@ -54,10 +55,13 @@ class IterativeFactor:
     """D, (n, n)."""
 
     normals: ContactNormals
-    """N, (C, n), with orthogonal rows."""
+    """N, (C, n)."""
 
     preconditioner: Array
-    """One over the mean diagonal entry of each node, (n,): the diagonal of M^-1."""
+    """One over the diagonal entries of D, (n,): the diagonal of M^-1."""
+
+    gram: PairGram
+    """G = N M^-1 N^T of all pairs."""
 
     smallest_eigenvalue: Array
     """m, the smallest eigenvalue of M^-1 D, scalar; estimated from above, within a factor of about
@@ -85,11 +89,8 @@ class IterativeFactor:
 
     @property
     def approximate_compliance(self) -> Array:
-        """Mean of the preconditioner on the unknowns of each pair, (C,): a scale, not a solution.
-
-        It stands for the diagonal of N D^-1 N^T with unit normals.
-        """
-        return jnp.mean(self.preconditioner[self.normals.unknowns], axis=1)
+        """Diagonal of N M^-1 N^T, (C,), for that of N D^-1 N^T: a scale, not a solution."""
+        return self.gram.diagonal
 
     def solve(self, rhs: Array) -> Array:
         """Return D^-1 rhs, (n,)."""
@@ -107,17 +108,19 @@ class IterativeFactor:
         Returns:
             w (n,) and the multiplier p (C,), zero outside A; NaN if the solve failed.
         """
-        normals, n = self.normals, rhs.shape[0]
-        lengths = jnp.sum(normals.weights**2, axis=1)
+        normals, scaled, n = self.normals, self.gram.scaled, rhs.shape[0]
+        by_gram = self.gram.inverse_on(active)
 
-        def restrict(x: Array) -> Array:
+        def restrict(x: Array, rows: ContactNormals, columns: ContactNormals) -> Array:
             # Twice: what is left along the normals is then relative to the result, not to x.
             for _ in range(2):
-                stretch = jnp.where(active, (normals @ x) / lengths, 0.0)
-                x = x - normals.transposed_product(stretch, n)
+                x = x - columns.transposed_product(by_gram(rows @ x), n)
             return x
 
-        lifted = normals.transposed_product(jnp.where(active, bound / lengths, 0.0), n)
+        def without_pressure(force: Array) -> Array:
+            return restrict(force, scaled, normals)
+
+        lifted = scaled.transposed_product(by_gram(jnp.where(active, bound, 0.0)), n)
         # Squares of norms of 1e-20 are zero in float32: in units of a power of two of its data.
         root = jnp.sqrt(self.preconditioner)
         unit = _power_of_two(jnp.max(jnp.maximum(jnp.abs(root * rhs), jnp.abs(lifted / root))))
@@ -129,21 +132,21 @@ class IterativeFactor:
             w = solution[0]
             size = terms + _norm(w, 1.0 / self.preconditioner)
             z, is_small = iterate(
-                lambda x: restrict(self.matrix @ x),
+                lambda x: without_pressure(self.matrix @ x),
                 self.preconditioner,
-                restrict(rhs - self.matrix @ w),
+                without_pressure(rhs - self.matrix @ w),
                 lambda change: self._wanted_residual(terms, size + change),
                 self.max_iterations,
             )
             # Many iterations gather rounding errors in the directions that are projected out.
-            return lifted + restrict(w + z), is_small
+            return lifted + restrict(w + z, normals, scaled), is_small
 
         # Twice: the residual of the recurrence misses its own rounding errors, which the second
         # run removes where they matter; where not it takes no iteration.
         w, has_ended = jax.lax.fori_loop(0, 2, improve, (lifted, jnp.array(False)))
         force = rhs - self.matrix @ w
-        p = jnp.where(active, (normals @ force) / lengths, 0.0)
-        error = _norm(restrict(force), self.preconditioner) / self.smallest_eigenvalue
+        p = by_gram(scaled @ force)
+        error = _norm(without_pressure(force), self.preconditioner) / self.smallest_eigenvalue
         size = terms + _norm(w, 1.0 / self.preconditioner)
         is_accurate = error <= self.tolerance**LARGEST_ERROR * size
         poison = jnp.where(has_ended & is_accurate, unit, jnp.nan)
@@ -153,7 +156,7 @@ class IterativeFactor:
         """Return the size of the residual at which the iteration stops, scalar.
 
         Args:
-            terms: |r| + |N_A^T b_A|, scalar.
+            terms: |r| + |lifted b_A|, scalar.
             size: |w| added to it, scalar.
         """
         allowed = self.tolerance**WANTED_ERROR * self.smallest_eigenvalue * size
@@ -177,15 +180,6 @@ def _norm(x: Array, weights: Array) -> Array:
 
 
 @jax.jit
-def _precondition(matrix: SymmetricMatrix, normals: ContactNormals) -> Array:
-    """Return one over the mean diagonal entry of each contact node, else over its own, (n,)."""
-    diagonal, unknowns = matrix.diagonal(), jnp.asarray(normals.unknowns)
-    # The components of a contact node share one number, so that the projection commutes.
-    mean = jnp.mean(diagonal[unknowns], axis=1, keepdims=True)
-    return 1.0 / diagonal.at[unknowns].set(jnp.broadcast_to(mean, unknowns.shape))
-
-
-@jax.jit
 def _find_smallest_eigenvalue(factor: IterativeFactor) -> Array:
     """Return the Rayleigh quotient of D^-1 M^(1/2) x for a random x, scalar.
 
@@ -201,7 +195,8 @@ def _find_smallest_eigenvalue(factor: IterativeFactor) -> Array:
 class ConjugateGradient:
     """Solve every step by preconditioned conjugate gradients; no factor is stored.
 
-    Works with `SemismoothNewton`, rigid obstacles, and contact sets in which no node occurs twice.
+    Works with `SemismoothNewton`. Where contact pairs share unknowns, as between two bodies, one
+    dense C x C matrix of all C pairs is kept and inverted for every active set.
     """
 
     tolerance: float = 1e-12
@@ -243,26 +238,20 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if the matrix is dense, an unknown belongs to two contact pairs, as with
-                two bodies, or the values are concrete and so ill-conditioned that no solve could
-                succeed.
+            ValueError: if the matrix is dense, or the values are concrete and so ill-conditioned
+                that no solve could succeed.
         """
         if matrix.columns is None:
             raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
-        unknowns = np.asarray(normals.unknowns)
-        if np.unique(unknowns).size != unknowns.size:
-            raise ValueError(
-                "ConjugateGradient needs contact sets without common nodes, against rigid "
-                "obstacles and not other bodies; use linear_solver=jc.NestedDissection()"
-            )
         floor = 8.0 * float(jnp.finfo(matrix.values.dtype).eps)
-        preconditioner = _precondition(matrix, normals)
+        preconditioner = 1.0 / matrix.diagonal()
         tolerance = max(self.tolerance, floor)
         # An infinite eigenvalue asks for no more than the tolerance.
         dtype = preconditioner.dtype
         unknown = jnp.asarray(np.inf, dtype)
+        gram = pair_gram(normals, preconditioner)
         factor = IterativeFactor(
-            matrix, normals, preconditioner, unknown, tolerance, self.max_iterations
+            matrix, normals, preconditioner, gram, unknown, tolerance, self.max_iterations
         )
         smallest = _find_smallest_eigenvalue(factor)
         least = _rounding(dtype) / tolerance**LARGEST_ERROR

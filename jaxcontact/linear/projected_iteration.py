@@ -1,8 +1,9 @@
 """Preconditioned conjugate gradients in the range of a projection, with the sizes of all terms.
 
-Solves P D P z = rest for an SPD matrix D and an orthogonal projection P that commutes with the
-diagonal preconditioner M^-1. The M-norms of z and of the direction follow from running scalars,
-because the scaled residual is M-orthogonal to z and to the old direction.
+Solves P D z = rest, z in the range of P^T, for an SPD matrix D and a projection P that is
+orthogonal in the norm of the diagonal preconditioner M^-1. The M-norms of z and of the direction
+follow from running scalars, because the scaled residual is M-orthogonal to z and to the old
+direction.
 
 Source: Hestenes, Stiefel (1952); Gould, Hribar, Nocedal, SIAM J. Sci. Comput. 23 (2001); running
 norms: Steihaug, SIAM J. Numer. Anal. 20 (1983).
@@ -22,7 +23,7 @@ class Iterate(NamedTuple):
     """The solution so far, and where it moves next."""
 
     z: Array
-    """Solution so far, (n,), in the range of P."""
+    """Solution so far, (n,), in the range of P^T."""
 
     residual: Array
     """P (rest - D z) by recurrence, (n,)."""

@@ -41,15 +41,9 @@ def check_steps(
 ) -> int:
     """Return the number of steps that control, steps and schedule agree on."""
     if control is None and steps is None and scheduled is None:
-        raise ValueError("give a control (T, N, d), a schedule, or the number of steps")
+        raise ValueError("give a control (T, N, d) or (T, n), a schedule, or the number of steps")
     if control is not None:
-        system = stepper.system
-        expected = (system.n_nodes, system.dimension)
-        if np.ndim(control) != 3 or np.shape(control)[1:] != expected:
-            raise ValueError(
-                f"control must have shape (T, N, d) = (T, {expected[0]}, {expected[1]}), got "
-                f"{np.shape(control)}; it lives on all nodes, the clamped ones included"
-            )
+        check_control(stepper.system, control)
         _check_finite("control", control)
         if steps is not None and steps != np.shape(control)[0]:
             raise ValueError(
@@ -65,6 +59,17 @@ def check_steps(
     if n_steps is None or n_steps < 1:
         raise ValueError(f"a simulation needs at least one step, got {n_steps}")
     return n_steps
+
+
+def check_control(system: System, control: Array) -> None:
+    """Check that a control has the shape (T, N, d) or, in unknowns, (T, n)."""
+    nodal = (system.n_nodes, system.dimension)
+    if np.shape(control)[1:] not in (nodal, (system.size,)):
+        raise ValueError(
+            f"control must have shape (T, N, d) = (T, {nodal[0]}, {nodal[1]}), on all nodes, the "
+            f"clamped ones included, or in unknowns (T, n) = (T, {system.size}), got "
+            f"{np.shape(control)}"
+        )
 
 
 def check_initial(stepper: Stepper, initial: State | None) -> State:
@@ -185,7 +190,7 @@ def _check_finite(name: str, value: Array) -> None:
 
 def check_every_step(trajectory: Trajectory) -> None:
     """Raise a ValueError if a trajectory does not hold the state of every step; see `simulate`."""
-    levels, steps = trajectory.displacement.shape[-3], trajectory.contact_impulse.shape[-2]
+    levels, steps = trajectory.unknowns.shape[-2], trajectory.contact_impulse.shape[-2]
     if levels != steps + 1:
         raise ValueError(
             f"the trajectory holds {levels} states of {steps} steps, but all {steps + 1} are "

@@ -18,7 +18,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
+from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.supports import (
     Flow,
     Moves,
@@ -29,6 +31,7 @@ from jaxcontact.motion.supports import (
     support_load,
     support_shapes,
 )
+from jaxcontact.motion.trajectory import State
 from jaxcontact.schemes import Scheme, StepState
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.mortar import area_vectors
@@ -139,6 +142,24 @@ def shifted(system: System, shift: Array) -> System:
     return replace(system, gap=system.gap + shift, gap_rounding=system.gap_rounding + own)
 
 
+def at_start(
+    stepper: Stepper, schedule: Schedule, initial: State | None
+) -> tuple[Stepper, State | None]:
+    """Return the stepper with the gaps at time zero, and the state without nodes that are moved."""
+    system = stepper.system
+    # What is concrete stays so and can be checked.
+    with jax.ensure_compile_time_eval():
+        shift = gap_shift(system, schedule)
+        first = system if shift is None else shifted(system, shift[0])
+        if initial is not None:
+            for name in schedule.motion:
+                nodes = system.parts.clamped[name].nodes
+                initial = jax.tree.map(
+                    lambda x, nodes=nodes: jnp.asarray(x).at[nodes].set(0.0), initial
+                )
+    return replace(stepper, system=first), initial
+
+
 def every_step(drive: Drive) -> StepDrive:
     """Return what each step sees, leaves (T, ...)."""
     old, new = (jax.tree.map(lambda x, s=s: x[s], drive[1:]) for s in (slice(-1), slice(1, None)))
@@ -157,17 +178,17 @@ def apply_drive(
     return system if step.shift is None else shifted(system, step.shift[1]), load
 
 
-def show_motion(system: System, schedule: Schedule, moves: Moves, fields: Moves) -> Moves:
-    """Return displacement and velocity (L, N, d) with those of the supports, moves (L, k)."""
+def show_motion(
+    system: System, schedule: Schedule, moves: Moves, fields: NodalFields
+) -> NodalFields:
+    """Return nodal fields (L, N, d) with those of the supports, moves (L, k)."""
     d = system.dimension
+    shown = [fields.displacement, fields.velocity]
     for number, name in enumerate(schedule.motion):
         nodes, axes = system.parts.clamped[name].nodes, slice(number * d, number * d + d)
-
-        def show(field: Array, values: Array, nodes=nodes, axes=axes) -> Array:
-            return field.at[:, nodes].set(values[:, None, axes])
-
-        fields = Moves(*map(show, fields, moves))
-    return fields
+        for kind, values in enumerate(moves):
+            shown[kind] = shown[kind].at[:, nodes].set(values[:, None, axes])
+    return NodalFields.tree_unflatten(None, (shown[0], shown[1]))
 
 
 def flow_of_drive(

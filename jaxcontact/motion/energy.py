@@ -16,13 +16,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxcontact.motion.checks import check_every_step
+from jaxcontact.motion.checks import check_control, check_every_step
 from jaxcontact.motion.drive import StepDrive, drive_of, every_step, flow_of_drive
+from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.supports import Flow, Moves, support_energy
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.terms import viscous_loss
+from jaxcontact.system.control_space import control_loads
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -64,38 +66,59 @@ class Energy:
         return self.kinetic + self.elastic
 
 
-@in_full_precision
-@jax.jit
 def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = None) -> Energy:
     """Return the energy ledger of a trajectory.
 
     Args:
         stepper: the stepper that made the trajectory.
         trajectory: every state of it, T steps; it knows the schedule that made it.
-        control: the control that made it, (T, N, d) [N/m^d].
+        control: the control that made it, (T, N, d) or (T, n) [N/m^d].
 
     Returns:
         Energies and flows; the identity of the module docstring holds to rounding.
 
     Raises:
-        ValueError: if the trajectory was recorded with a save_every other than 1.
+        ValueError: if the trajectory was recorded with a save_every other than 1, or is one of
+            another system, or the control has another shape.
     """
     check_every_step(trajectory)
+    unknowns, system = trajectory.unknowns, stepper.system
+    if unknowns.shape[1:] != (system.size,):
+        raise ValueError(
+            f"the trajectory has unknowns {unknowns.shape}, the system of the stepper "
+            f"{system.size}; hand over the stepper that made it"
+        )
+    if control is not None:
+        check_control(system, control)
+    records = (unknowns, trajectory.rates, trajectory.contact_impulse)
+    return _ledger(stepper, *records, control, trajectory.schedule)
+
+
+@in_full_precision
+@jax.jit
+def _ledger(
+    stepper: Stepper,
+    unknowns: Array,
+    rates: Array,
+    impulse: Array,
+    control: Array | None,
+    schedule: Schedule | None,
+) -> Energy:
     system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
     def nothing_yet(record: Array) -> Array:
         return jnp.concatenate([jnp.zeros_like(record[:1]), record])
 
     states = StepState(
-        displacement=system.restrict(trajectory.displacement),
-        velocity=system.restrict(trajectory.velocity),
-        impulse=nothing_yet(trajectory.contact_impulse),
+        displacement=unknowns,
+        velocity=rates,
+        impulse=nothing_yet(impulse),
         guesses=(),
     )
 
     drive = shapes = None
-    if trajectory.schedule is not None:
-        drive, shapes = drive_of(system, dt, trajectory.schedule)
+    if schedule is not None:
+        drive, shapes = drive_of(system, dt, schedule)
 
     def measure(state: StepState, moves: Moves | None) -> tuple[Array, Array]:
         kinetic = 0.5 * jnp.dot(state.velocity, operators.mass @ state.velocity)
@@ -105,8 +128,8 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         more = support_energy(shapes.supports, state, moves)
         return kinetic + more[0], elastic + more[1]
 
-    def flow(old: StepState, new: StepState, force: Array | None, step: StepDrive | None) -> Flow:
-        load = system.load if force is None else system.load + system.control_load(force)
+    def flow(old: StepState, new: StepState, added: Array | None, step: StepDrive | None) -> Flow:
+        load = system.load if added is None else system.load + added
         velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
         increment = new.displacement - old.displacement
         change = 0.5 * (
@@ -126,7 +149,8 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     kinetic, elastic = jax.lax.map(lambda level: measure(*level), levels)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
-    steps = (old, new, control, None if drive is None else every_step(drive))
+    loads = None if control is None else control_loads(system, control)
+    steps = (old, new, loads, None if drive is None else every_step(drive))
     flows = jax.lax.map(lambda step: flow(*step), steps)
     return Energy(
         kinetic=kinetic,

@@ -2,8 +2,8 @@
 
 With T steps, K = T / save_every recorded states and S segments of a checkpoint, in numbers:
 
-    trajectory    K (2 N d + n)              displacement, velocity, and the unknowns they are of
-                  K N d                      in a gradient, of which the cost reads displacements
+    trajectory    2 K n                      unknowns and their velocity
+                  K N d                      in a gradient, whose cost reads nodal displacements
     residuals     T C / 8                    one boolean per pair and step: loads, initial state
                   T (5 n + 3 C)              if matrices are differentiated (y, v, w, ...)
     checkpoint    (T / S) (...) + 2 S n      residuals of one segment, and the start of each
@@ -99,7 +99,7 @@ def estimate_memory(
     n_records = steps // save_every
 
     is_gradient = gradient or matrix_gradient
-    kept = field if is_gradient else 2 * field + vector
+    kept = field if is_gradient else 2 * vector
     trajectory = (n_records + 1) * (kept + pairs + item)
     n_problems = len(stepper.operators.problems)
     trajectory += steps * (pairs + 2 * n_problems * (pairs + n_pairs) + 8 + item)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,20 +18,22 @@ from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed
 from jaxcontact.motion.drive import (
     StepDrive,
     apply_drive,
+    at_start,
     drive_of,
     every_step,
-    gap_shift,
     shifted,
     show_motion,
 )
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
+from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.supports import Moves
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
+from jaxcontact.system.control_space import control_loads
 from jaxcontact.transforms.options import check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
@@ -56,7 +59,8 @@ def simulate(
 
     Args:
         stepper: from `prepare`.
-        control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or None.
+        control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or in
+            the unknowns of the system, (T, n), see `System.restrict_control`; or None.
         steps: number of steps T; default the length of the control or of the schedule.
         initial: state at time zero; default at rest without displacement. Where a schedule moves
             clamped nodes, they follow the schedule from the start.
@@ -87,7 +91,7 @@ def simulate(
     start, scheduled = stepper, None
     if schedule is not None:
         schedule, scheduled = check_schedule(stepper.system, schedule)
-        start, initial = _at_start(stepper, schedule, initial)
+        start, initial = at_start(stepper, schedule, initial)
     steps = check_steps(stepper, control, steps, scheduled)
     if isinstance(save_every, bool) or save_every < 1 or steps % save_every:
         raise ValueError(
@@ -108,30 +112,31 @@ def simulate(
         stepper = _open_along(stepper, control, initial, steps, weak_contact, schedule)
         weak_contact = ClosedBranch()
     with _forward_mode_advice():
-        trajectory = _run(
+        motion, moves = _run(
             stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule
         )
+    nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
+    if schedule is not None and moves is not None:
+        nodal = show_motion(stepper.system, schedule, moves, nodal)
+    trajectory = Trajectory(**motion._asdict(), nodal=nodal, schedule=schedule)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
 
 
-def _at_start(
-    stepper: Stepper, schedule: Schedule, initial: State | None
-) -> tuple[Stepper, State | None]:
-    """Return the stepper with the gaps at time zero, and the state without nodes that are moved."""
-    system = stepper.system
-    # What is concrete stays so and can be checked.
-    with jax.ensure_compile_time_eval():
-        shift = gap_shift(system, schedule)
-        first = system if shift is None else shifted(system, shift[0])
-        if initial is not None:
-            for name in schedule.motion:
-                nodes = system.parts.clamped[name].nodes
-                initial = jax.tree.map(
-                    lambda x, nodes=nodes: jnp.asarray(x).at[nodes].set(0.0), initial
-                )
-    return replace(stepper, system=first), initial
+class _Motion(NamedTuple):
+    """A `Trajectory` without its nodal fields."""
+
+    dt: Array
+    time: Array
+    unknowns: Array
+    rates: Array
+    gap: Array
+    contact_impulse: Array
+    contact: ContactRecord
+    iterations: Array
+    status: Array
+    residual: Array
 
 
 @in_full_precision
@@ -145,7 +150,7 @@ def _run(
     save_every: int,
     checkpoint: Checkpoint | None,
     schedule: Schedule | None,
-) -> Trajectory:
+) -> tuple[_Motion, Moves | None]:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
     drive = shapes = None
@@ -163,9 +168,15 @@ def _run(
         system.restrict(initial.velocity),
     )
 
+    if control is not None and system.basis is not None:
+        # One product with the basis for all steps, not one in each of them.
+        control = control_loads(system, control)
+
     def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation, StepDrive | None]):
         force, perturbation, driven = inputs
-        load = system.load if force is None else system.load + system.control_load(force)
+        load = system.load
+        if force is not None:
+            load = load + (force if system.basis is not None else system.control_load(force))
         load = load if perturbation.load is None else load + perturbation.load
         now = system
         if shapes is not None and driven is not None:
@@ -187,27 +198,24 @@ def _run(
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
-    velocity = jnp.concatenate([start.velocity[None], states.velocity])
     gap = system.gap[None, :] - jax.vmap(lambda y: system.normals @ y)(displacement)
-    fields = Moves(system.lift(displacement), system.lift(velocity))
-    if schedule is not None and drive is not None:
+    moves = None
+    if drive is not None:
         recorded = jax.tree.map(lambda x: x[::save_every], drive._replace(loads=None))
-        gap = gap if recorded.shift is None else gap + recorded.shift
-        if recorded.moves is not None:
-            fields = show_motion(system, schedule, recorded.moves, fields)
-    return Trajectory(
+        gap, moves = gap if recorded.shift is None else gap + recorded.shift, recorded.moves
+    motion = _Motion(
         dt=dt,
         time=dt * jnp.arange(0, steps + 1, save_every),
-        displacement=fields.displacement,
-        velocity=fields.velocity,
+        unknowns=displacement,
+        rates=jnp.concatenate([start.velocity[None], states.velocity]),
         gap=gap,
         contact_impulse=impulse,
         contact=contact,
         iterations=iterations,
         status=status,
         residual=residual,
-        schedule=schedule,
     )
+    return motion, moves
 
 
 def _record(dt: Array, solutions: tuple[Solution, ...]) -> ContactRecord:
@@ -250,7 +258,7 @@ def _open_along(
     tangents = tuple(tangent_of(x, dx) for x, dx in zip(primals, directions, strict=True))
 
     def contact(stepper: Stepper, control: Array | None, initial: State) -> ContactRecord:
-        return _run(stepper, control, initial, CriticalCone(), steps, 1, None, schedule).contact
+        return _run(stepper, control, initial, CriticalCone(), steps, 1, None, schedule)[0].contact
 
     record, tangent = jax.jvp(contact, primals, tangents)
     is_open = record.weak & ~(tangent.multiplier > 0.0)

@@ -5,14 +5,22 @@
 the minimum of y.Ay/2 - f.y over the admissible displacements: the contact problem of a time step
 with the stiffness matrix. Source: MATH.md 1 without inertia, Signorini's problem.
 
-A body without a clamped node has a singular A. Where its obstacles hold it, the closed pairs S of
-the equilibrium make A + c N_S^T N_S definite, with the same equilibrium under f + c N_S^T psi_S;
-S is that of A + s M with a small s. The equilibrium is unique if no rigid motion leaves S alone.
+A body without a clamped node has a singular A. Then the proximal iteration with a small s
+
+    (A + s M) y' + N^T c = f + s M y,    N y' <= psi,    c >= 0,    c . (psi - N y') = 0,
+
+converges to an equilibrium if there is one and wanders off if not. On its closed pairs A the same
+iteration with N_A y' = psi_A is linear, and is begun again at zero: what A does not hold stays
+where it is, so that its limit is the equilibrium on A that is nearest to zero in the norm of M.
+Errors of eigenvalue l shrink by s / (s + l) in each step.
+
+Source: Rockafellar, SIAM J. Control Optim. 14 (1976) 877-898.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,21 +28,27 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import Bound, ContactProblem, ContactSolver, Solution, Status
+from jaxcontact.contact import Bound, ContactProblem, ContactSolver, Guess, Solution, Status
+from jaxcontact.contact.saddle_point import Fixed, solve_on_cone
 from jaxcontact.linear import LinearSolver
 from jaxcontact.motion.checks import KEEP_PAIR, SolveError, refuse_closed
 from jaxcontact.motion.stepper import choose_solvers, factorize
-from jaxcontact.schemes.mass_redistribution import rigid_fields
 from jaxcontact.schemes.terms import gap_resolution
-from jaxcontact.system.block_matrix import BlockMatrix, from_symmetric
 from jaxcontact.system.bodies import body_numbers
+from jaxcontact.system.rollers import hold
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import poison_unless
 
-#: Singular values of the normal displacements of rigid motions of size one, above which a motion
-#: is held.
-HELD = 1e-5
+#: s in units of tr A / tr M, and the relative change at which the iteration has converged: powers
+#: of the unit roundoff, 1e-6 and 2e-10 in float64.
+SHIFT, SETTLED = 3 / 8, 5 / 8
+#: Steps that look for the closed pairs, and linear ones on them: (L / h)^2 s / 10 is the slowest
+#: rate on a body of L / h cells, 1e-3 for 100 of them.
+MAX_SEARCHES, STEPS = 30, 12
+#: How far ahead of the last step the next one starts, in changes, while all moves on steadily: from
+#: any height a body falls to its obstacle by ways that double.
+AHEAD = 2.0
 
 
 @jax.tree_util.register_dataclass
@@ -73,9 +87,11 @@ def solve_static(
     The gap of the system may be negative: then the obstacle has been pushed into the body, which
     is how a body is pressed on it with a given displacement.
 
+    A body without clamped nodes must be in balance with what its contact can carry, without
+    friction. Where it may slide, the equilibrium is that nearest to the undeformed place.
+
     Args:
-        system: the discretised scene; what is not clamped must be held by the obstacles, without
-            friction, under the load of the scene.
+        system: the discretised scene.
         linear_solver: factorises the stiffness matrix, default chosen from the size.
         contact_solver: default `SemismoothNewton()`.
 
@@ -83,21 +99,22 @@ def solve_static(
         The equilibrium.
 
     Raises:
-        ValueError: if a body is neither clamped nor held by its contact, an option is not an object
-            of its kind, the solvers do not fit each other, or the stiffness matrix is not positive
-            definite.
-        SolveError: if the result is concrete and was not solved.
+        ValueError: if an option is not an object of its kind, the solvers do not fit each other, a
+            body without clamped nodes is to be solved for with soft contact, or the stiffness
+            matrix is not positive definite.
+        SolveError: if the result is concrete and was not solved, or there is no equilibrium.
         Both are NaN under jit or grad where only values decide.
 
-    Derivative: reverse mode by every value of the system, on the active set.
+    Derivative: reverse mode by every value of the system, on the active set. A change that pushes
+    along a motion which nothing holds has no equilibrium, and no derivative either.
     """
     solvers = choose_solvers(system, linear_solver, contact_solver)
-    rigid = _rigid_motions(system)
-    if rigid.shape[1] == 0:
+    loose = _loose_bodies(system)
+    if not loose:
         problem = factorize(system, system.stiffness, *solvers)
-        y, solution = _solve(system, problem, system.load)
+        y, solution = _solve(system, problem)
     else:
-        y, solution = _solve_held(system, rigid, *solvers)
+        y, solution = _solve_loose(system, loose, *solvers)
     (y, force), status = refuse_closed(system, y, (y, solution.multiplier), solution.status)
     _check(status)
     return StaticContact(
@@ -111,76 +128,153 @@ def solve_static(
 
 
 @jax.jit
-def _solve(system: System, problem: ContactProblem, load: Array) -> tuple[Array, Solution]:
+def _solve(system: System, problem: ContactProblem) -> tuple[Array, Solution]:
     """Return the unknowns (n,) of the equilibrium and the solution on the contact pairs."""
     return problem.solve(
-        load,
-        Bound(system.gap, gap_resolution(system, jnp.zeros_like(load))),
+        system.load,
+        Bound(system.gap, gap_resolution(system, jnp.zeros_like(system.load))),
         problem.form.first_guess()._replace(active=system.gap < 0.0),
     )
 
 
-def _rigid_motions(system: System) -> Array:
-    """Return the rigid motions of the bodies without a clamped node, (n, r)."""
-    d, free = system.dimension, np.asarray(system.free_nodes)
+def _loose_bodies(system: System) -> list[np.ndarray]:
+    """Return the nodes of each body without a clamped node."""
     body = body_numbers(system)
-    held = np.unique(np.delete(body, free))
-    motions = [jnp.zeros((system.n_nodes, d, 0), system.dtype)]
-    for number in np.setdiff1d(np.unique(body), held):
-        is_body = jnp.asarray(body == number)[:, None, None]
-        fields = jnp.asarray(rigid_fields(system.points))[..., : d * (d + 1) // 2]
-        motions.append(jnp.where(is_body, fields, 0.0))
-    fields = jnp.concatenate(motions, axis=2)
-    return jnp.moveaxis(jax.vmap(system.restrict, in_axes=2)(fields), 0, 1)
+    held = np.delete(body, np.asarray(system.free_nodes))
+    return [np.flatnonzero(body == number) for number in np.setdiff1d(body, held)]
 
 
-def _solve_held(
-    system: System, rigid: Array, linear_solver: LinearSolver, contact_solver: ContactSolver
+class _Search(NamedTuple):
+    """The proximal iteration for the closed pairs."""
+
+    displacement: Array
+    """y, (n,) [m]."""
+
+    centre: Array
+    """Where the next step is bound to, (n,) [m]: y, or beyond it while all moves on steadily."""
+
+    change: Array
+    """Last change of y, (n,) [m]."""
+
+    solution: Solution
+    """Solution on the contact pairs."""
+
+    steps: Array
+    """Steps so far, int32."""
+
+
+def _solve_loose(
+    system: System,
+    loose: list[np.ndarray],
+    linear_solver: LinearSolver,
+    contact_solver: ContactSolver,
 ) -> tuple[Array, Solution]:
-    """Return unknowns and solution where the contact holds the rigid motions (n, r)."""
-    if system.basis is not None or not contact_solver.is_exact:
+    """Return unknowns and solution where some bodies have no clamped node."""
+    if not contact_solver.is_exact:
         raise ValueError(
-            "a body without a clamped node can be solved for on its mesh and with exact contact "
-            "only; clamp a facet set, or use the unreduced system and jc.SemismoothNewton()"
+            "a body without a clamped node can be solved for with exact contact only; clamp a "
+            "facet set, or use jc.SemismoothNewton()"
         )
-    A, M = system.stiffness, system.mass.expand()
-    stiff = jax.lax.stop_gradient(jnp.mean(A.diagonal()))
-    shift = jnp.finfo(system.dtype).eps ** 0.5 * stiff / jnp.mean(M.diagonal())
-    constant = jax.lax.stop_gradient((system, A + shift * M))
-    problem = factorize(*constant, linear_solver, contact_solver)
-    closed = _solve(constant[0], problem, constant[0].load)[1].multiplier > 0.0
-
-    rows = jnp.where(closed[:, None], jax.vmap(lambda x: system.normals @ x, 1, 1)(rigid), 0.0)
-    if system.rollers is not None:
-        rollers = system.rollers
-        rows = jnp.concatenate([rows, jax.vmap(lambda x: rollers @ x, 1, 1)(rigid)])
-    n_held = jnp.sum(jnp.linalg.svd(rows, compute_uv=False) > HELD)
-    _check_held(n_held, rigid.shape[1])
-    weights, nodes = system.normals.weights, np.asarray(system.contact_nodes)
-    weights = jnp.where(closed[:, None], weights, 0.0)
-    numbers = np.asarray(system.node_numbers)[nodes]
-    springs = BlockMatrix(numbers, numbers, stiff * weights[:, :, None] * weights[:, None, :])
-    n_nodes, d = len(system.free_nodes), system.dimension
-    matrix = from_symmetric(A, d).plus(springs).to_symmetric(n_nodes)
-    preload = system.normals.transposed_product(jnp.where(closed, system.gap, 0.0), system.size)
+    diagonals = jax.lax.stop_gradient((system.stiffness.diagonal(), system.mass.diagonal()))
+    eps = float(jnp.finfo(system.dtype).eps)
+    shift = eps**SHIFT * jnp.mean(diagonals[0]) / jnp.mean(diagonals[1])
+    matrix = shift * (system.mass + (1.0 / shift) * system.stiffness)
     problem = factorize(system, matrix, linear_solver, contact_solver)
-    y, solution = _solve(system, problem, system.load + stiff * preload)
-    # Springs that are stretched would be a force from nowhere.
-    is_equilibrium = jnp.all(solution.active | ~closed)
-    status = jnp.where(is_equilibrium, solution.status, Status.NOT_CONVERGED)
-    is_valid = is_equilibrium & (n_held == rigid.shape[1])
-    y, multiplier = poison_unless(is_valid, (y, solution.multiplier))
-    return y, solution._replace(status=status, multiplier=multiplier)
+    found = _search(*jax.lax.stop_gradient((system, problem, shift)))
+    y, p, last = _settle(system, problem, found.solution.active)
+
+    gap, size = system.gap - system.normals @ y, jnp.max(jnp.abs(y))
+    noise = eps**SETTLED * size + gap_resolution(system, y)
+    is_settled = _size(last) <= eps**SETTLED * size
+    is_equilibrium = is_settled & jnp.all(gap >= -noise) & jnp.all(p >= -(eps**SETTLED) * _size(p))
+    solved = found.solution.status
+    status = jnp.where(is_equilibrium, solved, jnp.maximum(solved, Status.NOT_CONVERGED))
+    is_found = _size(found.change) <= eps**SETTLED * _size(found.displacement)
+    moving = system.lift(jnp.where(is_found, last, found.change))
+    if not isinstance(status, Tracer) and int(solved) <= Status.FALLBACK < int(status):
+        raise SolveError(_without_equilibrium(system, loose, np.asarray(moving)))
+    y, p = poison_unless(status <= Status.FALLBACK, (y, jnp.maximum(p, 0.0)))
+    return y, found.solution._replace(status=status, multiplier=p)
 
 
-def _check_held(n_held: Array, n_rigid: int) -> None:
-    if isinstance(n_held, Tracer) or int(n_held) == n_rigid:
-        return
-    raise ValueError(
-        f"the contact holds {int(n_held)} of {n_rigid} rigid motions of what is not clamped, so "
-        "that there is no unique equilibrium: without friction a body slides along a plane; clamp "
-        "a facet set, or let jc.simulate with jc.BackwardEuler() come to rest"
+@jax.jit
+def _search(system: System, problem: ContactProblem, shift: Array) -> _Search:
+    """Return the proximal iteration where it has converged, or after `MAX_SEARCHES` steps."""
+    tolerance = float(jnp.finfo(system.dtype).eps) ** SETTLED
+
+    def step(y: Array, centre: Array, guess: Guess) -> tuple[Array, Solution]:
+        bound = Bound(system.gap, gap_resolution(system, y))
+        return problem.solve(system.load + shift * (system.mass @ centre), bound, guess)
+
+    def is_unfinished(search: _Search) -> Array:
+        is_moving = _size(search.change) > tolerance * _size(search.displacement)
+        is_solved = search.solution.status <= Status.FALLBACK
+        return is_solved & is_moving & (search.steps < MAX_SEARCHES)
+
+    def advance(search: _Search) -> _Search:
+        y, solution = step(search.displacement, search.centre, search.solution.guess)
+        change = y - search.displacement
+        is_steady = jnp.vdot(change, search.change) > 0.5 * jnp.vdot(search.change, search.change)
+        centre = jnp.where(is_steady, y + AHEAD * change, y)
+        return _Search(y, centre, change, solution, search.steps + 1)
+
+    nothing = jnp.zeros_like(system.load)
+    guess = problem.form.first_guess()._replace(active=system.gap < 0.0)
+    y, solution = step(nothing, nothing, guess)
+    start = _Search(y, y, y, solution, jnp.int32(1))
+    return jax.lax.while_loop(is_unfinished, advance, start)
+
+
+@jax.jit
+def _settle(system: System, problem: ContactProblem, pairs: Array) -> tuple[Array, Array, Array]:
+    """Return y (n,) and the force (C,) of the limit on closed pairs (C,) bool, and the last change.
+
+    Every step solves for the change, whose rounding errors are smaller than those of y.
+    """
+    normals, n = system.normals, system.size
+    fixed = Fixed(problem.matrix.columns, normals.unknowns, problem.form, None, None, None)
+
+    def step(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        y, p = state
+        rest = system.load - system.stiffness @ y - normals.transposed_product(p, n)
+        rest = hold(system.rollers, rest)
+        change, push = solve_on_cone(
+            problem.matrix.values,
+            normals.weights,
+            fixed,
+            pairs,
+            None,
+            rest,
+            system.gap - normals @ y,
+        )
+        change = hold(system.rollers, change)
+        return (y + change, p + push), change
+
+    start = jnp.zeros_like(system.load), jnp.zeros_like(system.gap)
+    (y, p), changes = jax.lax.scan(step, start, None, length=STEPS)
+    return y, p, changes[-1]
+
+
+def _size(x: Array) -> Array:
+    return jnp.max(jnp.abs(x), initial=0.0)
+
+
+def _without_equilibrium(system: System, loose: list[np.ndarray], moving: np.ndarray) -> str:
+    """Return what moves on, by its mean change (N, d)."""
+    means = [moving[nodes].mean(axis=0) for nodes in loose]
+    worst = int(np.argmax([np.linalg.norm(mean) for mean in means]))
+    centre = np.asarray(system.points)[loose[worst]].mean(axis=0)
+    direction = means[worst] / max(float(np.linalg.norm(means[worst])), np.finfo(float).tiny)
+    return (
+        f"no equilibrium was found: the body around {_listed(centre)} moves on along "
+        f"{_listed(direction)}, since its load is not carried by its contact, which has no "
+        "friction; clamp a facet set, add an obstacle, or let jc.simulate with "
+        "jc.BackwardEuler() show where it goes"
     )
+
+
+def _listed(x: np.ndarray) -> str:
+    return "(" + ", ".join(f"{entry:.3g}" for entry in x) + ")"
 
 
 def _check(status: Array) -> None:

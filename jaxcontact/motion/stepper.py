@@ -48,17 +48,20 @@ class StepPerturbation(NamedTuple):
     is_open: Array | None = None
     """Pairs that are open in the derivative, whatever their state, (T, P, C) bool."""
 
+    closed: Array | None = None
+    """The pairs that keep contact in every step, whatever the signs, (T, P, C) bool; the motion is
+    then affine in its data. None is contact."""
+
     def on(self, operators: Operators, dt: Array) -> Operators:
         """Return the perturbed operators of one step, whose part of the perturbation this is."""
-        if self.gap is None and self.push is None and self.is_open is None:
+        parts = (self.gap, self.push, self.is_open, self.closed)
+        if all(part is None for part in parts):
             return operators
 
         def change(number: int, problem: ContactProblem) -> ContactProblem:
-            gap, push, is_open = (
-                None if x is None else x[number] for x in (self.gap, self.push, self.is_open)
-            )
+            gap, *others = (None if x is None else x[number] for x in parts)
             bound = None if gap is None else gap / dt
-            return replace(problem, perturbation=Perturbation(bound, push, is_open))
+            return replace(problem, perturbation=Perturbation(bound, *others))
 
         return operators.changed(change)
 

@@ -1,4 +1,7 @@
-"""What a simulation returns, and what it may start from."""
+"""What a simulation returns, and what it may start from.
+
+A motion is recorded in its unknowns, and nodal fields are lifted from them when they are asked for.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.scene.scene import Scene, clamped_nodes
 
@@ -119,7 +123,7 @@ class ContactRecord:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """The motion of a body over T steps; N nodes, C contact pairs, dimension d."""
+    """The motion of a body over T steps; n unknowns, N nodes, C contact pairs, dimension d."""
 
     dt: Array
     """Length of a time step, scalar [s]."""
@@ -127,11 +131,15 @@ class Trajectory:
     time: Array
     """Time levels, (T+1,) [s]."""
 
-    displacement: Array
-    """Nodal displacement, (T+1, N, d) [m]."""
+    unknowns: Array
+    """The unknowns of the system, (T+1, n): free displacement components [m], or coordinates in the
+    space of a reduced model [m kg^1/2]."""
 
-    velocity: Array
-    """Nodal velocity, (T+1, N, d) [m/s]."""
+    rates: Array
+    """Velocity of the unknowns, (T+1, n)."""
+
+    nodal: NodalFields
+    """What `displacement` and `velocity` are taken from."""
 
     gap: Array
     """Distance to the obstacle along the normal, (T+1, C) [m]; never negative beyond rounding."""
@@ -153,6 +161,16 @@ class Trajectory:
 
     schedule: Schedule | None = None
     """What changed in time beside the control; `energy` reads it."""
+
+    @property
+    def displacement(self) -> Array:
+        """Nodal displacement, (T+1, N, d) [m]; lifted from the unknowns when it is asked for."""
+        return self.nodal.displacement
+
+    @property
+    def velocity(self) -> Array:
+        """Nodal velocity, (T+1, N, d) [m/s]; lifted when it is asked for."""
+        return self.nodal.velocity
 
     @property
     def contact_force(self) -> Array:
@@ -203,4 +221,4 @@ class Trajectory:
     @property
     def final(self) -> State:
         """The state after the last step."""
-        return State(self.displacement[-1], self.velocity[-1])
+        return State(*self.nodal.at(-1))

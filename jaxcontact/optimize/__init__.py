@@ -4,6 +4,7 @@ from jaxcontact.control.actuators import Actuator, actuator, boundary_actuator
 from jaxcontact.optimize.certificate import Stationarity
 from jaxcontact.optimize.descend import Descent, descend
 from jaxcontact.optimize.driver import optimize
+from jaxcontact.optimize.finish import ExactFinish
 from jaxcontact.optimize.homotopy import Homotopy
 from jaxcontact.optimize.lbfgs import LBFGS
 from jaxcontact.optimize.line_search import WeakWolfe
@@ -19,6 +20,7 @@ __all__ = [
     "Actuator",
     "Descent",
     "Ending",
+    "ExactFinish",
     "History",
     "Homotopy",
     "NewtonCG",

@@ -90,10 +90,11 @@ def optimize(
     and an error, for instance in the callback, carries the same as its attribute `result`.
 
     Args:
-        objective: maps a control (T, N, d) to a scalar, differentiable by JAX. A bound method of
-            a pytree such as `problem.objective`, or a `jax.tree_util.Partial` of arrays, is
-            compiled as a whole; any other function runs as it is.
-        u0: control to start from, (T, N, d), or the argument of the map `controls`; or a
+        objective: maps a control (T, N, d), or in unknowns (T, n), to a scalar, differentiable by
+            JAX. A bound method of a pytree such as `problem.objective`, or a
+            `jax.tree_util.Partial` of arrays, is compiled as a whole; any other function runs as
+            it is.
+        u0: control to start from, (T, N, d) or (T, n), or the argument of the map `controls`; or a
             `Result` of the same method, which is continued as if it had never stopped.
         method: the method; default `LBFGS()`.
         system: the discretised scene, which defines the inner product.

@@ -4,21 +4,28 @@
 
 by trust-region Newton-CG for a decreasing sequence of kappa, each started at the last minimiser.
 J_kappa is smooth, its Hessian products are exact, and on weak contact its adjoint tends to the one
-with the right share of the multiplier: the path ends at strong stationarity, where methods for
-the exact problem stall at kinks. Source: MATH.md 5.
+with the right share of the multiplier: the path leads to strong stationarity, where methods for
+the exact problem stall at kinks. Its gaps tell which pairs are weak there, and an exact finish does
+the rest (`finish.py`), so the first problems are solved loosely. Source: MATH.md 5.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
+
+from jax import Array
 
 from jaxcontact.contact import RelaxedContact
 from jaxcontact.control.problem import Point, Problem
 from jaxcontact.motion.stepper import with_contact
+from jaxcontact.optimize.certificate import motion_of
+from jaxcontact.optimize.finish import ExactFinish
 from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
+from jaxcontact.optimize.pattern import identify
 from jaxcontact.optimize.trust_region import conjugate_gradient_path
 
 #: The first relaxation changes the objective at the start by about this fraction.
@@ -29,6 +36,17 @@ LAST_FORCING, MAX_LAST_PRODUCTS = 1e-2, 300
 
 #: Trials for the first kappa.
 MAX_TRIALS = 40
+
+
+#: Accuracy of the first relaxed problems, relative to the gradient at the start: more of it does
+#: not help the next one, and not the finish.
+LOOSE = (3e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+#: The trust region of a new level is at least this times the norm of the control.
+LEAST_RADIUS = 1e-3
+
+#: The first level from which the path is extrapolated.
+FIRST_EXTRAPOLATED = 2
 
 
 class HomotopyState(NamedTuple):
@@ -52,12 +70,26 @@ class HomotopyState(NamedTuple):
     norm: float
     """Gradient norm of the last relaxed problem at its solution."""
 
+    relaxed: Array
+    """Parameters of the last relaxed minimiser."""
+
+    before: Array
+    """Parameters of the relaxed minimiser before that."""
+
+    finish_level: int = 0
+    """The level after which the finish was tried last."""
+
+    is_certified: bool = False
+    """Whether the finish has reached its tolerance with all signs right."""
+
 
 @dataclass(frozen=True)
 class Homotopy:
-    """Newton-CG on relaxed contact with kappa -> 0; the method that converges at kinks.
+    """Newton-CG on relaxed contact with kappa -> 0, and an exact finish: for minimisers at kinks.
 
-    One iteration of `optimize` is one kappa; values in the history are those of the exact problem.
+    One iteration of `optimize` is one kappa, or one finish; values in the history are those of the
+    exact problem. It ends as `Ending.CERTIFIED` at a control that is strongly stationary to
+    rounding: see `Stationarity.is_strong` for what that proves.
 
     The contact solver is exchanged inside the objective, so the objective must be a pytree that
     holds the stepper: a bound method of a registered dataclass, such as
@@ -72,10 +104,18 @@ class Homotopy:
     """Factor from one kappa to the next."""
 
     levels: int = 13
-    """Number of kappas. The error of the last solution is about the root of the last kappa."""
+    """Most kappas. Without the finish, the error is about the root of the last one."""
 
     tolerance: float = 1e-9
-    """Each relaxed problem is solved to this times the gradient norm at the start."""
+    """Each relaxed problem is solved to this times the gradient norm at the start; with a finish
+    the first ones less accurately."""
+
+    finish: ExactFinish | None = field(default_factory=ExactFinish)
+    """How the path ends in an exactly stationary control; None follows it to the last kappa. There
+    is no finish with bounds, or if the objective does not tell its motion."""
+
+    finish_from: int = 6
+    """Number of relaxed problems before the finish is tried."""
 
     max_steps: int = 100
     """Newton steps per kappa."""
@@ -89,25 +129,47 @@ class Homotopy:
     def init(self, problem: Problem, point: Point) -> HomotopyState:
         """Return the state at the start."""
         norm = float(problem.gradient_norm(point))
-        return HomotopyState(point, 0, 0.0, math.inf, norm, norm)
+        start = point.parameters
+        return HomotopyState(point, 0, 0.0, math.inf, norm, norm, start, start)
 
     def step(self, problem: Problem, state: HomotopyState) -> tuple[HomotopyState, Ending | None]:
-        """Return the state after the next kappa, or why it is the last."""
+        """Return the state after the next kappa or the finish, or why it is the last."""
+        if state.is_certified:
+            return state, Ending.CERTIFIED
+        motion = motion_of(problem)
+        first = max(self.finish_from, 2)  # two levels tell where the path leads
+        finish = self.finish if problem.bounds is None and self.levels >= first else None
+        if finish is not None and motion is not None:
+            if state.level >= max(first, state.finish_level + 1):
+                return self._finished(problem, state, finish, motion), None
         if state.level == self.levels:
             return state, Ending.RELAXED
+        is_loose = finish is not None and motion is not None
+        return self._next_level(problem, state, is_loose)
+
+    def _next_level(
+        self, problem: Problem, state: HomotopyState, is_loose: bool
+    ) -> tuple[HomotopyState, Ending | None]:
+        """Return the state after the next kappa."""
         kappa = self.reduction * state.kappa if state.level else self.first_kappa
         if kappa is None:
             kappa, relaxed, start = _first_relaxation(problem, state.point)
         else:
             relaxed = _relax(problem, kappa)
-            start = relaxed.evaluate(state.point.parameters)
+            start = relaxed.evaluate(state.relaxed)
         if not math.isfinite(start.value):
             return state, Ending.RELAXED_NOT_FINITE
+        if state.level >= FIRST_EXTRAPOLATED:
+            start = _extrapolated(relaxed, state, kappa, self.reduction, start)
         # Before touch the exact gradient can be zero where the relaxed one is not.
         first_norm = state.first_norm or float(relaxed.gradient_norm(start))
-        inner = NewtonCGState(start, state.radius, first_norm)
+        tolerance = self.tolerance
+        if is_loose:
+            tolerance = max(tolerance, LOOSE[min(state.level, len(LOOSE) - 1)])
+        norm = math.sqrt(max(float(problem.dot(start.parameters, start.parameters)), 0.0))
+        inner = NewtonCGState(start, max(state.radius, LEAST_RADIUS * norm), first_norm)
         for _ in range(self.max_steps):
-            if relaxed.gradient_norm(inner.point) <= self.tolerance * first_norm:
+            if relaxed.gradient_norm(inner.point) <= tolerance * first_norm:
                 break
             following, ending = self.newton.step(relaxed, inner)
             if ending is not None:
@@ -115,14 +177,40 @@ class Homotopy:
             if following is None:
                 break
             inner = following
-        return HomotopyState(
+        return state._replace(
             point=problem.evaluate(inner.point.parameters),
             level=state.level + 1,
             kappa=kappa,
             radius=inner.radius,
             first_norm=first_norm,
             norm=float(relaxed.gradient_norm(inner.point)),
+            relaxed=inner.point.parameters,
+            before=state.relaxed,
         ), None
+
+    def _finished(
+        self, problem: Problem, state: HomotopyState, finish: ExactFinish, motion: Callable
+    ) -> HomotopyState:
+        """Return the state after the finish from the last two minimisers."""
+        levels = (state.kappa / self.reduction, state.before), (state.kappa, state.relaxed)
+        pattern = identify(problem, motion, levels)
+        end = finish.run(problem, motion, state.relaxed, pattern, state.first_norm)
+        point = problem.evaluate(end.parameters)
+        return state._replace(
+            point=point if end.is_right or point.value < state.point.value else state.point,
+            finish_level=state.level,
+            is_certified=end.is_right,
+        )
+
+
+def _extrapolated(
+    relaxed: Problem, state: HomotopyState, kappa: float, reduction: float, start: Point
+) -> Point:
+    """Return the better one of a start and the point ahead on the path, linear in sqrt(kappa)."""
+    root, last, before = (math.sqrt(x) for x in (kappa, state.kappa, state.kappa / reduction))
+    share = (root - last) / (last - before)
+    ahead = relaxed.evaluate(state.relaxed + share * (state.relaxed - state.before))
+    return ahead if ahead.value < start.value else start
 
 
 def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None:
@@ -135,7 +223,7 @@ def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None
         return None
     path = conjugate_gradient_path(
         point.derivative,
-        lambda direction: problem.hessian_product(point.parameters, direction),
+        problem.hessian(point.parameters),
         problem.riesz,
         radius=math.inf,
         tolerance=LAST_FORCING,

@@ -41,6 +41,10 @@ class Ending(StrEnum):
         "not finite: the objective or its gradient is not finite after an update; start from "
         "result.parameters with a smaller learning rate"
     )
+    CERTIFIED = (
+        "certified: strongly stationary to rounding, with the right sign of every multiplier; "
+        "result.stationarity holds the certificate"
+    )
     RELAXED = (
         "relaxed: the last relaxed problem is solved; for a smaller kappa hand the result to "
         "optimize in place of u0 with more levels"

@@ -70,9 +70,7 @@ class NewtonCG:
         if not bool(jnp.any(derivative != 0.0)):
             return state, Ending.VANISHED
 
-        def hessian(direction: Array) -> Array:
-            return problem.hessian_product(point.parameters, direction)
-
+        hessian = problem.hessian(point.parameters)
         norm = float(problem.gradient_norm(point))
         path = conjugate_gradient_path(
             derivative,

@@ -51,7 +51,7 @@ class Result:
     """The best control found, with the course of the optimisation."""
 
     control: Array = field(repr=False)
-    """The control with the lowest value that was met, (T, N, d)."""
+    """The control with the lowest value that was met, (T, N, d) or (T, n)."""
 
     parameters: Array = field(repr=False)
     """What was optimised: the control itself, or the argument of the map `controls`."""

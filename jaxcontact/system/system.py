@@ -17,6 +17,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxcontact.system.basis import Basis
+from jaxcontact.system.control_space import control_loads, solve_mass
+from jaxcontact.system.lift import Lift
 from jaxcontact.system.pair_set import PairSet, pair_numbers
 from jaxcontact.system.parts import Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
@@ -172,7 +174,13 @@ class System:
 
     def lift(self, x: Array) -> Array:
         """Return the nodal field (..., N, d) of unknowns (..., n); zero on clamped nodes."""
-        return _lift(self, x)
+        return self.lifting(x)
+
+    @property
+    def lifting(self) -> Lift:
+        """What `lift` needs of the system, without its matrices."""
+        vectors = None if self.basis is None else self.basis.vectors
+        return Lift(self.node_numbers, vectors, self.dimension, self.is_clamped)
 
     @in_full_precision
     @jax.jit
@@ -192,7 +200,9 @@ class System:
 
     @in_full_precision
     def control_load(self, control: Array) -> Array:
-        """Return the load (n,) [N] of a force density (N, d) [N/m^d]: L u of MATH.md 1."""
+        """Return the load (n,) [N] of a force density (N, d) or (n,) [N/m^d]: L u of MATH.md 1."""
+        if control.ndim == 1:
+            return self.l2_mass @ control
         return self.nodal_load(self.nodal_mass @ control)
 
     @in_full_precision
@@ -201,15 +211,11 @@ class System:
         load = self.free_components(forces)
         return load if self.basis is None else load @ self.basis.vectors
 
+    def restrict_control(self, control: Array) -> Array:
+        """Return the control (T, n) in unknowns that acts as a control (T, N, d) [N/m^d].
 
-@in_full_precision
-@jax.jit
-def _lift(system: System, x: Array) -> Array:
-    if system.basis is not None:
-        x = x @ system.basis.vectors.T
-    free = x.reshape(*x.shape[:-1], -1, system.dimension)
-    if not system.is_clamped:
-        return free
-    padding = jnp.zeros((*free.shape[:-2], 1, system.dimension), x.dtype)
-    free = jnp.concatenate([free, padding], axis=-2)
-    return jnp.take(free, system.node_numbers, axis=-2, mode="clip")
+        It is c with L_n c = V^T L u, the L2 projection: its load is the same, and `lift` makes it
+        nodal. An optimal control of a reduced model is of this kind: it is a multiple of the
+        adjoint state, which lies in the space.
+        """
+        return solve_mass(self.l2_mass, control_loads(self, control))

@@ -62,7 +62,8 @@ def quotient(there, here, length):
 @jax.jit
 def derivative_of_cost(trajectory, tangent):
     """The derivative of `cost` along the tangent of a trajectory"""
-    fields, tangents = ({name: getattr(x, name) for name in FIELDS} for x in (trajectory, tangent))
+    names = [name for name in (*FIELDS, "nodal") if name not in ("displacement", "velocity")]
+    fields, tangents = ({name: getattr(x, name) for name in names} for x in (trajectory, tangent))
     return jax.jvp(lambda fields: cost(replace(trajectory, **fields)), (fields,), (tangents,))[1]
 
 

@@ -273,16 +273,6 @@ def test_conjugate_gradient_stops_at_its_tolerance(tolerance):
     assert 0.01 * tolerance < residual_of_a_solve(tolerance) <= 1.1 * tolerance
 
 
-def test_conjugate_gradient_refuses_contact_sets_that_share_a_node():
-    mesh = jc.meshes.rectangle((1.0, 1.0), h=1 / 3)
-    plane = jc.HalfSpace(np.array([0.0, -0.01]), np.array([0.0, 1.0]))
-    wall = jc.HalfSpace(np.array([-0.01, 0.0]), np.array([1.0, 0.0]))
-    material = jc.KelvinVoigt(young=1.0, poisson=0.3)
-    system = jc.discretize(jc.Scene(mesh, material, contact={"bottom": plane, "left": wall}))
-    with pytest.raises(ValueError, match="common nodes"):
-        jc.prepare(system, DT, linear_solver=iterate())
-
-
 def exhausted():
     stepper = steppers()["cg"]
     short = iterate(max_iterations=3)

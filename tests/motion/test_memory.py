@@ -1,5 +1,7 @@
 """Claims about memory: it is predicted before a run, and checkpoints bound it."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,8 +71,11 @@ def test_estimate_memory_is_within_a_factor_of_two(stepper, kind, save_every, ch
     def misfit(*arguments):
         return jnp.sum(run(*arguments).displacement ** 2)
 
+    def recorded(stepper):
+        return replace(run(stepper, None), nodal=None)
+
     if kind == "forward":
-        used = compiled_bytes(run, stepper, None)
+        used = compiled_bytes(recorded, stepper)
     elif kind == "gradient":
         control = jax.ShapeDtypeStruct(shape, system.dtype)
         size = np.prod(shape) * system.dtype.itemsize

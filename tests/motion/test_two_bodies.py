@@ -173,9 +173,10 @@ def test_adjoint_across_two_bodies_is_the_transpose(fall):
     [
         {"linear_solver": jc.Dense()},
         {"linear_solver": jc.NestedDissection(leaf_size=8)},
+        {"linear_solver": jc.ConjugateGradient()},
         {"contact_solver": jc.ProjectedGaussSeidel(max_sweeps=10_000)},
     ],
-    ids=["dense", "dissection", "gauss-seidel"],
+    ids=["dense", "dissection", "gradients", "gauss-seidel"],
 )
 def test_solvers_agree_on_two_bodies(blocks, fall, options):
     found = fall_of(blocks, **options)[1].displacement

@@ -129,7 +129,7 @@ def test_optimize_interrupted_returns_the_best_so_far(problem, method):
     def interrupted(u):
         nonlocal count
         count += 1
-        if count == 12:
+        if count == 6:
             raise KeyboardInterrupt
         return objective(u)
 

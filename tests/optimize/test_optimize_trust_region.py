@@ -82,7 +82,7 @@ def test_newton_cg_takes_one_step_on_a_quadratic():
         iterations=1,
     )
     np.testing.assert_allclose(result.control, -jnp.linalg.solve(hessian, derivative), rtol=1e-9)
-    assert result.history.hessian_products[-1] <= 6
+    assert result.history.hessian_products[-1] <= 7  # one to linearise
 
 
 def test_newton_cg_converges_superlinearly():

@@ -1,3 +1,5 @@
+import importlib
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -120,9 +122,21 @@ def touching():
     return Grazing(jc.prepare(jc.discretize(scene), DT), WALL)
 
 
-def test_stationarity_with_too_many_weak_pairs_raises():
+def test_stationarity_holds_hundreds_of_weak_pairs():
+    # Never pressed and never away: at rest the distance to the target is the best possible one.
     problem = touching()
-    with pytest.raises(ValueError, match="600 node-steps"):
+    rest = jnp.zeros((600, 2, 1))
+    certificate = jc.stationarity(problem.objective, rest, **problem.options)
+    assert len(certificate.weak_pairs) == certificate.rank == 600
+    assert certificate.residual < 1e-12
+    assert certificate.is_strong
+
+
+def test_stationarity_whose_rows_do_not_fit_in_memory_raises(monkeypatch):
+    rows = importlib.import_module("jaxcontact.optimize.weak_rows")
+    monkeypatch.setattr(rows, "available_memory", lambda: 10**6)
+    problem = touching()
+    with pytest.raises(ValueError, match=r"600 node-steps .* need 0\.017 GB"):
         jc.stationarity(problem.objective, jnp.zeros((600, 2, 1)), **problem.options)
 
 
@@ -137,7 +151,9 @@ def test_optimize_reports_stationarity_where_the_objective_tells_its_motion():
     assert "the objective does not tell its motion; hand over a bound method" in repr(unknown)
 
 
-def test_optimize_says_that_too_many_weak_pairs_have_no_certificate():
+def test_optimize_says_that_too_many_weak_pairs_have_no_certificate(monkeypatch):
+    rows = importlib.import_module("jaxcontact.optimize.weak_rows")
+    monkeypatch.setattr(rows, "available_memory", lambda: 10**6)
     problem = touching()
     result = jc.optimize(problem.objective, jnp.zeros((600, 2, 1)), iterations=0, **problem.options)
     assert result.stationarity is None
