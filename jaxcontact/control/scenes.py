@@ -1,4 +1,4 @@
-"""Ready-made scenes: the half disc of the paper's section 5 and its control problem, two bodies."""
+"""Ready-made scenes: the paper's half disc and its control problem, two bodies, Hertz in 3D."""
 
 from __future__ import annotations
 
@@ -17,11 +17,15 @@ from jaxcontact.scene import meshes
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.join import join
 from jaxcontact.scene.material import KelvinVoigt
+from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import HalfSpace
 from jaxcontact.scene.scene import Scene
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.discretize import discretize
+from jaxcontact.system.system import System
 
 RADIUS = 15.0
+#: Where the centre of the ball comes to lie, below its middle: cells are nearer to the contact.
+NEARER = 0.8
 #: Half a turn in the plane.
 UPSIDE_DOWN = np.diag([-1.0, -1.0])
 RUBBER = KelvinVoigt(young=1e8, poisson=0.3, bulk_viscosity=1e4, shear_viscosity=1e4, density=1.0)
@@ -109,6 +113,40 @@ def bars(n_resting: int = 1, h: float = 0.02, gap: float = 1e-3) -> Scene:
         mesh=join({f"bar{k}": bar.moved(translation=[x]) for k, x in enumerate(places)}),
         material=KelvinVoigt(young=1.0, poisson=0.0),
         contact={f"bar{k}/left": Facets(f"bar{k - 1}/right") for k in range(1, n_resting + 1)},
+    )
+
+
+def ball_on_plane(h: float = 1 / 8, gap: float = 0.0) -> Scene:
+    """Return a ball above a rigid plane, the upper half of its surface clamped: Hertz in 3D.
+
+    Radius, Young's modulus and density are one (SI units), nu = 0.3. The ball is mapped onto itself
+    by a Möbius transformation, which keeps angles and makes the cells at the lowest point nine
+    times smaller. Pressed on the plane by a depth d (`System.with_gap`), it carries by Hertz
+    4/3 E* d^(3/2), E* = E / (1 - nu^2), with a contact radius d^(1/2). For d from 0.0025 to 0.01
+    and h = 1/8, 1/12 (2460 and 7812 unknowns) the load is 12 to 15 % and 8 to 9 % higher: by the
+    mesh, of second order in h, and by 4 to 6 % since the clamp is not infinitely far away.
+
+    Args:
+        h: mesh size before the map, [m].
+        gap: height of the lowest point above the plane, [m].
+
+    Source: Johnson, Contact Mechanics (1985), 4.2; Ratcliffe, Foundations of Hyperbolic Manifolds
+    (2006), 4.5.
+    """
+    half, up = meshes.half_ball(1.0, h=h), np.array([0.0, 0.0, 1.0])
+    is_below = half.points[:, 2] < 0.0  # the others are their own mirror images
+    mirror = np.where(is_below, half.n_nodes - 1 + np.cumsum(is_below), np.arange(half.n_nodes))
+    x = np.concatenate([half.points, half.points[is_below] * [1.0, 1.0, -1.0]])
+    cells = np.concatenate([half.cells, mirror[half.cells][:, [1, 0, 2, 3]]])
+    squares, along = np.sum(x**2, axis=1)[:, None], -2.0 * NEARER * x[:, 2:]
+    moved = (1.0 + along + squares) * -NEARER * up + (1.0 - NEARER**2) * x
+    ball = Mesh.from_arrays(moved / (1.0 + along + NEARER**2 * squares), cells)
+    ball = ball.with_set("upper", lambda _, n: n[:, 2] > 0.0)
+    return Scene(
+        mesh=ball.with_set("lowest", lambda x, _: x[:, 2] < -0.96),
+        material=KelvinVoigt(young=1.0, poisson=0.3),
+        clamped=("upper",),
+        contact={"lowest": HalfSpace(point=-(1.0 + gap) * up, normal=up)},
     )
 
 

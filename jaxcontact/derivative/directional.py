@@ -67,6 +67,9 @@ def directional_derivative(
             f"direction must have the shape of the control, {shape}, got {np.shape(direction)}; "
             "without a control, give a control of zeros"
         )
+    rest = jnp.zeros_like(stepper.system.points)
+    initial_direction = None if initial_direction is None else initial_direction.filled(rest)
+    initial = None if initial is None else initial.filled(rest)
     if initial is None and initial_direction is not None:
         initial = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x)), initial_direction)
     primals = jax.tree.map(jnp.asarray, (stepper, control, initial))
