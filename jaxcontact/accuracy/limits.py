@@ -66,12 +66,14 @@ def _linearised_gap(
     system = stepper.system
     nodes, y = np.asarray(system.contact_nodes), trajectory.displacement
     curvature = np.zeros(system.n_nodes)
-    for name, obstacle in scene.contact.items():
-        if isinstance(obstacle, Facets):
-            continue
+    for name, obstacles in scene.contact.items():
         own = np.unique(scene.mesh.facets[name])
-        hessians = jax.vmap(jax.hessian(obstacle.signed_distance))(system.points[own])
-        curvature[own] = np.maximum(curvature[own], np.linalg.norm(hessians, ord=2, axis=(1, 2)))
+        for obstacle in obstacles if isinstance(obstacles, tuple) else (obstacles,):
+            if isinstance(obstacle, Facets):
+                continue
+            hessians = jax.vmap(jax.hessian(obstacle.signed_distance))(system.points[own])
+            bent = np.linalg.norm(np.asarray(hessians), ord=2, axis=(1, 2))
+            curvature[own] = np.maximum(curvature[own], bent)
     if not nodes.size or not np.any(curvature[nodes] > 0.0):
         return ""
     moved = jnp.max(jnp.sum(y[:, nodes] ** 2, axis=-1), axis=0)
