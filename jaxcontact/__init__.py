@@ -10,6 +10,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaxcontact import reference
+from jaxcontact.accuracy.estimate import ErrorEstimate, estimate_error
+from jaxcontact.accuracy.recommend import Recommendation, recommend
+from jaxcontact.accuracy.reduction_error import ReductionError, reduction_error
 from jaxcontact.contact import (
     AlongDirection,
     ClosedBranch,
@@ -112,6 +115,7 @@ __all__ = [
     "Descent",
     "Ending",
     "Energy",
+    "ErrorEstimate",
     "ExactFinish",
     "Facets",
     "GradientCheck",
@@ -129,7 +133,9 @@ __all__ = [
     "Optax",
     "PhaseMean",
     "ProjectedGaussSeidel",
+    "Recommendation",
     "RedistributedMass",
+    "ReductionError",
     "RelaxedContact",
     "Result",
     "Scene",
@@ -166,6 +172,7 @@ __all__ = [
     "directional_derivative",
     "discretize",
     "energy",
+    "estimate_error",
     "estimate_memory",
     "export",
     "join",
@@ -179,7 +186,9 @@ __all__ = [
     "plot",
     "prepare",
     "read_mesh",
+    "recommend",
     "reduce",
+    "reduction_error",
     "reference",
     "sample",
     "scenes",
