@@ -9,7 +9,7 @@ import numpy as np
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.scene.facets import Facets
-from jaxcontact.scene.scene import Scene
+from jaxcontact.scene.scene import Scene, contact_obstacles
 
 #: Strain or rotation beyond which the linear theory is off by per cent.
 LARGEST_STRAIN = 0.1
@@ -66,7 +66,7 @@ def _linearised_gap(
     system = stepper.system
     nodes, y = np.asarray(system.contact_nodes), trajectory.displacement
     curvature = np.zeros(system.n_nodes)
-    for name, obstacle in scene.contact.items():
+    for name, obstacle in contact_obstacles(scene):
         if isinstance(obstacle, Facets):
             continue
         own = np.unique(scene.mesh.facets[name])

@@ -15,8 +15,9 @@ from jaxcontact.motion.stepper import Stepper, prepare
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.scene.scene import Scene
 from jaxcontact.schemes import ContactImplicit, Scheme
+from jaxcontact.system.discretize import discretize
 from jaxcontact.system.reduction import enrich, reduce
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.system import System
 
 #: Factors of the time step of the runs that stand for one: a single run is a lottery with the
 #: phase of the impact in its step.
