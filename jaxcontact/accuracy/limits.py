@@ -9,7 +9,7 @@ import numpy as np
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.scene.facets import Facets
-from jaxcontact.scene.scene import Scene
+from jaxcontact.scene.scene import Scene, contact_obstacles
 
 #: Strain or rotation beyond which the linear theory is off by per cent.
 LARGEST_STRAIN = 0.1
@@ -66,14 +66,12 @@ def _linearised_gap(
     system = stepper.system
     nodes, y = np.asarray(system.contact_nodes), trajectory.displacement
     curvature = np.zeros(system.n_nodes)
-    for name, obstacles in scene.contact.items():
+    for name, obstacle in contact_obstacles(scene):
+        if isinstance(obstacle, Facets):
+            continue
         own = np.unique(scene.mesh.facets[name])
-        for obstacle in obstacles if isinstance(obstacles, tuple) else (obstacles,):
-            if isinstance(obstacle, Facets):
-                continue
-            hessians = jax.vmap(jax.hessian(obstacle.signed_distance))(system.points[own])
-            bent = np.linalg.norm(np.asarray(hessians), ord=2, axis=(1, 2))
-            curvature[own] = np.maximum(curvature[own], bent)
+        hessians = jax.vmap(jax.hessian(obstacle.signed_distance))(system.points[own])
+        curvature[own] = np.maximum(curvature[own], np.linalg.norm(hessians, ord=2, axis=(1, 2)))
     if not nodes.size or not np.any(curvature[nodes] > 0.0):
         return ""
     moved = jnp.max(jnp.sum(y[:, nodes] ** 2, axis=-1), axis=0)

@@ -242,6 +242,25 @@ def test_adjoint_of_the_schedule_passes_the_dot_product_test():
     assert forward == pytest.approx(backward, rel=1e-10)
 
 
+def test_directional_derivative_by_a_schedule_is_that_of_differences():
+    stepper, schedule = moving_wall(12, 0.1, None)
+
+    def final(factor):
+        scaled = jax.tree.map(lambda x: factor * x, schedule)
+        return jc.simulate(stepper, schedule=scaled).displacement[-1]
+
+    tangent = jc.directional_derivative(
+        stepper, None, schedule=schedule, schedule_direction=schedule
+    )
+    step = 1e-6
+    central = (final(1.0 + step) - final(1.0 - step)) / (2.0 * step)
+    np.testing.assert_allclose(tangent.displacement[-1], central, atol=1e-8)
+    with pytest.raises(ValueError, match="shapes of the schedule"):
+        jc.directional_derivative(
+            stepper, None, schedule=schedule, schedule_direction=jc.Schedule(gap=np.zeros((37, 1)))
+        )
+
+
 def test_no_array_holds_every_unknown_of_every_step():
     stepper, steps = press(), 60
     schedule = everything(stepper, steps)
