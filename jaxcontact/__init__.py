@@ -10,6 +10,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaxcontact import reference
+from jaxcontact.accuracy.estimate import ErrorEstimate, estimate_error
+from jaxcontact.accuracy.recommend import Recommendation, recommend
+from jaxcontact.accuracy.reduction_error import ReductionError, reduction_error
 from jaxcontact.contact import (
     AlongDirection,
     ClosedBranch,
@@ -37,10 +40,13 @@ from jaxcontact.derivative import (
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
+from jaxcontact.motion.linearization import linearization_error, turned_gap
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
 from jaxcontact.motion.pressure import contact_pressure
+from jaxcontact.motion.schedule import Schedule, sample
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
+from jaxcontact.motion.step import step
 from jaxcontact.motion.stepper import Stepper, prepare, with_contact
 from jaxcontact.motion.stress import Stress, stress
 from jaxcontact.motion.trajectory import State, Trajectory
@@ -66,6 +72,7 @@ from jaxcontact.optimize import (
     stationarity,
 )
 from jaxcontact.scene import meshes
+from jaxcontact.scene.compound import Along, Union
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.io import read_mesh
 from jaxcontact.scene.join import join
@@ -81,9 +88,10 @@ from jaxcontact.schemes import (
     RedistributedMass,
     Trapezoidal,
 )
+from jaxcontact.system.discretize import discretize
 from jaxcontact.system.files import load_system
 from jaxcontact.system.reduction import reduce
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.system import System
 from jaxcontact.transforms.time_loop import Checkpoint
 
 if TYPE_CHECKING:
@@ -92,6 +100,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LBFGS",
     "Actuator",
+    "Along",
     "AlongDirection",
     "BackwardEuler",
     "Ball",
@@ -106,6 +115,7 @@ __all__ = [
     "Descent",
     "Ending",
     "Energy",
+    "ErrorEstimate",
     "ExactFinish",
     "Facets",
     "GradientCheck",
@@ -123,10 +133,13 @@ __all__ = [
     "Optax",
     "PhaseMean",
     "ProjectedGaussSeidel",
+    "Recommendation",
     "RedistributedMass",
+    "ReductionError",
     "RelaxedContact",
     "Result",
     "Scene",
+    "Schedule",
     "SemismoothNewton",
     "SignedDistance",
     "SmoothedContact",
@@ -143,6 +156,7 @@ __all__ = [
     "TrackingCost",
     "Trajectory",
     "Trapezoidal",
+    "Union",
     "Verdict",
     "WeakWolfe",
     "actuator",
@@ -158,10 +172,12 @@ __all__ = [
     "directional_derivative",
     "discretize",
     "energy",
+    "estimate_error",
     "estimate_memory",
     "export",
     "join",
     "l2_value_and_grad",
+    "linearization_error",
     "load_result",
     "load_system",
     "meshes",
@@ -170,13 +186,18 @@ __all__ = [
     "plot",
     "prepare",
     "read_mesh",
+    "recommend",
     "reduce",
+    "reduction_error",
     "reference",
+    "sample",
     "scenes",
     "simulate",
     "solve_static",
     "stationarity",
+    "step",
     "stress",
+    "turned_gap",
     "with_contact",
 ]
 

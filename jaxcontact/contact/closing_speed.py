@@ -44,13 +44,13 @@ class StartingState(Protocol):
     """What a motion starts from: a `State`."""
 
     @property
-    def displacement(self) -> Array:
-        """Nodal displacement, (N, d) [m]."""
+    def displacement(self) -> Array | None:
+        """Nodal displacement, (N, d) [m]; None is zero."""
         ...
 
     @property
-    def velocity(self) -> Array:
-        """Nodal velocity, (N, d) [m/s]."""
+    def velocity(self) -> Array | None:
+        """Nodal velocity, (N, d) [m/s]; None is zero."""
         ...
 
 
@@ -88,7 +88,12 @@ def _free_flight(system: System, initial: StartingState | None) -> Array:
         extent = jnp.max(jnp.max(system.points, axis=0) - jnp.min(system.points, axis=0))
         gap = jnp.where(system.gap > 4.0 * system.gap_rounding, system.gap, extent)
         return jnp.sqrt(jnp.max(2.0 * towards * gap, initial=0.0))
-    gap = system.gap - system.normals @ system.restrict(jnp.asarray(initial.displacement))
-    velocity = system.normals @ system.restrict(jnp.asarray(initial.velocity))
+
+    def along_normals(field: Array | None) -> Array:
+        field = jnp.zeros_like(system.points) if field is None else jnp.asarray(field)
+        return system.normals @ system.restrict(field)
+
+    gap = system.gap - along_normals(initial.displacement)
+    velocity = along_normals(initial.velocity)
     squares = jnp.maximum(velocity, 0.0) ** 2 + 2.0 * towards * jnp.maximum(gap, 0.0)
     return jnp.sqrt(jnp.max(squares, initial=0.0))

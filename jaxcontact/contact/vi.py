@@ -32,6 +32,7 @@ from jaxcontact.contact.saddle_point import Fixed
 from jaxcontact.contact.tangent import solve_forward
 from jaxcontact.contact.weak import WeakContact
 from jaxcontact.linear import Factor
+from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 
@@ -79,13 +80,16 @@ class ContactProblem:
     """One SPD matrix with the contact normals: all that is constant in a step's VI."""
 
     matrix: SymmetricMatrix
-    """D, (n, n) SPD."""
+    """D, (n, n) SPD; with rollers P D P + s (I - P)."""
 
     normals: ContactNormals
-    """N, (C, n)."""
+    """N, (C, n); with rollers N P."""
 
     form: ContactForm
     """Factor of D and contact solver, in the form that the factor allows."""
+
+    rollers: ContactNormals | None = None
+    """Directions in which nodes are held, R of P = I - R^T R, (H, n); None is P = I."""
 
     perturbation: Perturbation = NO_PERTURBATION
     """What the VI is perturbed by."""
@@ -111,13 +115,15 @@ class ContactProblem:
             guess: where to start: `form.first_guess` or the guess of the last step's solution.
 
         Returns:
-            w (n,), NaN if the problem was not solved, and the solution on the contact pairs.
+            w (n,), in the range of P, NaN if the problem was not solved, and the solution on the
+            contact pairs.
 
         Derivative: reverse mode of every order, with respect to the values of the matrix and the
         normals, r and b; forward mode if `weak_contact` names a treatment. The iteration itself
         is never differentiated. A step keeps one boolean per pair for its backward pass, and w
         and p only if matrix or normals are differentiated.
         """
+        rhs = hold(self.rollers, rhs)
         if self.normals.count == 0:
             return self._solve_without_contact(rhs, bound, guess)
         shift, push, is_open, closed = self.perturbation
@@ -141,6 +147,8 @@ class ContactProblem:
         # Multiplication poisons value and gradient alike; a `where` would leave a zero gradient.
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(velocity.dtype)
         multiplier = solution.multiplier if push is None else solution.multiplier + push
+        # Once more, for the error of an iterative linear solver.
+        velocity = hold(self.rollers, velocity)
         return velocity * poison, solution._replace(
             multiplier=multiplier * poison,
             workspace=jax.lax.stop_gradient(solution.workspace),
@@ -155,6 +163,7 @@ class ContactProblem:
         velocity = jax.lax.custom_linear_solve(
             lambda w: self.matrix @ w, rhs, lambda _, r: factor.solve(r), symmetric=True
         )
+        velocity = hold(self.rollers, velocity)
         is_finite = jnp.all(jnp.isfinite(velocity))
         status = jnp.where(is_finite, Status.CONVERGED, Status.NON_FINITE).astype(jnp.int32)
         zero = jnp.zeros((), rhs.dtype)
@@ -169,8 +178,9 @@ def contact_problem(
     normals: ContactNormals,
     factor: Factor,
     contact_solver: ContactSolver,
+    rollers: ContactNormals | None = None,
 ) -> ContactProblem:
-    """Return the contact problem of a factorised matrix.
+    """Return the contact problem of a factorised matrix, both already of the range of P.
 
     Raises:
         ValueError: as `contact_form`.
@@ -178,4 +188,4 @@ def contact_problem(
     form = contact_form(factor, contact_solver)
     uses_compliance = contact_solver.uses_compliance and normals.count > 0
     compliance = pair_compliance(matrix, normals, factor) if uses_compliance else None
-    return ContactProblem(matrix, normals, form, compliance=compliance)
+    return ContactProblem(matrix, normals, form, rollers, compliance=compliance)

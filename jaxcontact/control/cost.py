@@ -95,7 +95,10 @@ class TrackingCost:
         """
         check_every_step(trajectory)
         levels, *nodal = np.shape(self.distance.target)
+        # The unknowns know nothing of supports that a schedule moves.
+        is_moved = trajectory.schedule is not None and bool(trajectory.schedule.motion)
         is_reduced = self.reduced is not None and self.reduced.fits(trajectory.unknowns)
+        is_reduced = is_reduced and not is_moved
         motion = trajectory.unknowns if is_reduced else trajectory.displacement
         if np.shape(motion)[0] != levels or not (is_reduced or np.shape(motion)[1:] == (*nodal,)):
             raise ValueError(

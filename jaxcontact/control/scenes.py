@@ -20,7 +20,8 @@ from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import HalfSpace
 from jaxcontact.scene.scene import Scene
-from jaxcontact.system.system import System, discretize
+from jaxcontact.system.discretize import discretize
+from jaxcontact.system.system import System
 
 RADIUS = 15.0
 #: Where the centre of the ball comes to lie, below its middle: cells are nearer to the contact.

@@ -21,6 +21,7 @@ from jax.core import Tracer
 
 from jaxcontact.contact import CriticalCone
 from jaxcontact.motion.checks import raise_if_failed
+from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
@@ -38,6 +39,8 @@ def directional_derivative(
     initial: State | None = None,
     initial_direction: State | None = None,
     stepper_direction: Stepper | None = None,
+    schedule: Schedule | None = None,
+    schedule_direction: Schedule | None = None,
 ) -> Trajectory:
     """Return the one-sided derivative of the motion along a direction.
 
@@ -52,6 +55,8 @@ def directional_derivative(
         initial_direction: direction of the initial state; None is zero.
         stepper_direction: direction of the stepper, as `jax.jvp` of a function that ends in
             `prepare` returns it; None is zero.
+        schedule: what changes in time beside the control.
+        schedule_direction: direction of the schedule, with arrays in the same places; None is zero.
 
     Returns:
         A trajectory that holds the derivatives of time, displacement, velocity, gap and
@@ -67,19 +72,30 @@ def directional_derivative(
             f"direction must have the shape of the control, {shape}, got {np.shape(direction)}; "
             "without a control, give a control of zeros"
         )
+    rest = jnp.zeros_like(stepper.system.points)
+    initial_direction = None if initial_direction is None else initial_direction.filled(rest)
+    initial = None if initial is None else initial.filled(rest)
     if initial is None and initial_direction is not None:
         initial = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x)), initial_direction)
-    primals = jax.tree.map(jnp.asarray, (stepper, control, initial))
+    if schedule_direction is not None and (
+        jax.tree.map(np.shape, schedule_direction) != jax.tree.map(np.shape, schedule)
+    ):
+        raise ValueError("schedule_direction must have arrays of the shapes of the schedule")
+    primals = jax.tree.map(jnp.asarray, (stepper, control, initial, schedule))
     if stepper_direction is None:
         stepper_direction = tangent_of(primals[0], None)
     tangents = (
         stepper_direction,
         tangent_of(primals[1], direction),
         tangent_of(primals[2], initial_direction),
+        tangent_of(primals[3], schedule_direction),
     )
+    options = {"steps": steps, "weak_contact": CriticalCone()}
 
-    def motion(stepper: Stepper, control: Array | None, initial: State | None) -> Trajectory:
-        return simulate(stepper, control, steps=steps, initial=initial, weak_contact=CriticalCone())
+    def motion(
+        stepper: Stepper, control: Array | None, initial: State | None, schedule: Schedule | None
+    ) -> Trajectory:
+        return simulate(stepper, control, initial=initial, schedule=schedule, **options)
 
     trajectory, tangent = jax.jvp(motion, primals, tangents)
     if not isinstance(trajectory.status, Tracer):

@@ -240,10 +240,10 @@ class ConjugateGradient:
             coordinates: not used.
 
         Raises:
-            ValueError: if the matrix is dense, or the values are concrete and so ill-conditioned
-                that no solve could succeed.
+            ValueError: if the model is a reduced one, or the values are concrete and so
+                ill-conditioned that no solve could succeed.
         """
-        if matrix.columns is None:
+        if normals.unknowns is None:
             raise ValueError("matrices of a reduced model are dense; use linear_solver=jc.Dense()")
         floor = 8.0 * float(jnp.finfo(matrix.values.dtype).eps)
         preconditioner = 1.0 / matrix.diagonal()

@@ -36,10 +36,12 @@ class SolveError(RuntimeError):
     """A time step was not solved; the message names step, time and what to try."""
 
 
-def check_steps(stepper: Stepper, control: Array | None, steps: int | None) -> int:
-    """Return the number of steps that control and steps agree on."""
-    if control is None and steps is None:
-        raise ValueError("give a control (T, N, d) or (T, n), or the number of steps")
+def check_steps(
+    stepper: Stepper, control: Array | None, steps: int | None, scheduled: int | None = None
+) -> int:
+    """Return the number of steps that control, steps and schedule agree on."""
+    if control is None and steps is None and scheduled is None:
+        raise ValueError("give a control (T, N, d) or (T, n), a schedule, or the number of steps")
     if control is not None:
         check_control(stepper.system, control)
         _check_finite("control", control)
@@ -48,7 +50,12 @@ def check_steps(stepper: Stepper, control: Array | None, steps: int | None) -> i
                 f"steps={steps} does not fit a control of {np.shape(control)[0]} steps; leave "
                 "steps out or cut the control"
             )
-    n_steps = steps if control is None else np.shape(control)[0]
+    n_steps = np.shape(control)[0] if control is not None else scheduled if steps is None else steps
+    if scheduled is not None and n_steps != scheduled:
+        raise ValueError(
+            f"the schedule is for {scheduled} steps, but the motion has {n_steps}; forces have T "
+            "rows and motions T+1"
+        )
     if n_steps is None or n_steps < 1:
         raise ValueError(f"a simulation needs at least one step, got {n_steps}")
     return n_steps
@@ -72,9 +79,9 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
     """
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
-    if initial is None:
+    if initial is None or initial.displacement is None or initial.velocity is None:
         rest = jnp.asarray(np.zeros(shape, system.dtype))
-        initial = State(rest, rest)
+        initial = (State() if initial is None else initial).filled(rest)
     for name in ("displacement", "velocity"):
         value = getattr(initial, name)
         if np.shape(value) != shape:
@@ -124,6 +131,8 @@ class _Wrong(NamedTuple):
 @in_full_precision
 @jax.jit
 def _find_wrong(system: System, state: State) -> _Wrong:
+    assert state.displacement is not None
+    assert state.velocity is not None
     return _Wrong(
         _moved(system, state.displacement),
         _moved(system, state.velocity),

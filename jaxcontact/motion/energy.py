@@ -4,7 +4,8 @@ With E = 1/2 v.Mv + 1/2 y.Ay, each step of a scheme satisfies an identity
 
     E' - E = work - viscous loss - impact loss - numerical loss        (to rounding)
 
-with the scheme's own terms; `residual` is what is missing. Source: MATH.md 2.
+with the scheme's own terms; `residual` is what is missing. What supports and obstacles that move
+add to it is in `drive.py` and `supports.py`. Source: MATH.md 2.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.motion.checks import check_control, check_every_step
+from jaxcontact.motion.drive import StepDrive, drive_of, every_step, flow_of_drive
+from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.stepper import Stepper
+from jaxcontact.motion.supports import Flow, Moves, support_energy
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.schemes import Losses, StepState
+from jaxcontact.schemes import StepState
 from jaxcontact.schemes.terms import viscous_loss
 from jaxcontact.system.control_space import control_loads
 from jaxcontact.transforms.precision import in_full_precision
@@ -40,7 +44,8 @@ class Energy:
     those of y.Ay, whose terms are (L/h)^2 times as large as their sum."""
 
     work: Array
-    """Work of control, body force and traction in each step, (T,) [J]."""
+    """Work of control, body force, traction, pressure, and of supports and obstacles that move, in
+    each step, (T,) [J]."""
 
     viscous_loss: Array
     """Energy dissipated by the viscosity in each step, (T,) [J], not negative."""
@@ -66,7 +71,7 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
 
     Args:
         stepper: the stepper that made the trajectory.
-        trajectory: every state of it, T steps.
+        trajectory: every state of it, T steps; it knows the schedule that made it.
         control: the control that made it, (T, N, d) or (T, n) [N/m^d].
 
     Returns:
@@ -85,13 +90,19 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
         )
     if control is not None:
         check_control(system, control)
-    return _ledger(stepper, unknowns, trajectory.rates, trajectory.contact_impulse, control)
+    records = (unknowns, trajectory.rates, trajectory.contact_impulse)
+    return _ledger(stepper, *records, control, trajectory.schedule)
 
 
 @in_full_precision
 @jax.jit
 def _ledger(
-    stepper: Stepper, unknowns: Array, rates: Array, impulse: Array, control: Array | None
+    stepper: Stepper,
+    unknowns: Array,
+    rates: Array,
+    impulse: Array,
+    control: Array | None,
+    schedule: Schedule | None,
 ) -> Energy:
     system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
@@ -105,14 +116,19 @@ def _ledger(
         guesses=(),
     )
 
-    def measure(state: StepState) -> tuple[Array, Array]:
+    drive = shapes = None
+    if schedule is not None:
+        drive, shapes = drive_of(system, dt, schedule)
+
+    def measure(state: StepState, moves: Moves | None) -> tuple[Array, Array]:
         kinetic = 0.5 * jnp.dot(state.velocity, operators.mass @ state.velocity)
         elastic = 0.5 * jnp.dot(state.displacement, system.stiffness @ state.displacement)
-        return kinetic, elastic
+        if shapes is None or shapes.supports is None or moves is None:
+            return kinetic, elastic
+        more = support_energy(shapes.supports, state, moves)
+        return kinetic + more[0], elastic + more[1]
 
-    def flow(
-        old: StepState, new: StepState, added: Array | None
-    ) -> tuple[Array, Array, Array, Losses]:
+    def flow(old: StepState, new: StepState, added: Array | None, step: StepDrive | None) -> Flow:
         load = system.load if added is None else system.load + added
         velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
         increment = new.displacement - old.displacement
@@ -121,21 +137,28 @@ def _ledger(
             + jnp.dot(increment, system.stiffness @ displacement)
         )
         losses = stepper.scheme.losses(system, operators, dt, old, new)
-        return change, jnp.dot(increment, load), viscous_loss(system, dt, increment), losses
+        numerical = jnp.asarray(losses.numerical, change.dtype)
+        viscous = viscous_loss(system, dt, increment)
+        own = Flow(change, jnp.dot(increment, load), viscous, losses.impact, numerical)
+        if shapes is None or step is None:
+            return own
+        more = flow_of_drive(stepper.scheme, system, dt, shapes, step, old, new)
+        return jax.tree.map(jnp.add, own, more)
 
-    kinetic, elastic = jax.lax.map(measure, states)
+    levels = (states, None if drive is None else drive.moves)
+    kinetic, elastic = jax.lax.map(lambda level: measure(*level), levels)
     old = jax.tree.map(lambda record: record[:-1], states)
     new = jax.tree.map(lambda record: record[1:], states)
     loads = None if control is None else control_loads(system, control)
-    change, work, viscous, losses = jax.lax.map(lambda step: flow(*step), (old, new, loads))
-    numerical = jnp.asarray(losses.numerical, change.dtype)
+    steps = (old, new, loads, None if drive is None else every_step(drive))
+    flows = jax.lax.map(lambda step: flow(*step), steps)
     return Energy(
         kinetic=kinetic,
         elastic=elastic,
-        change=change,
-        work=work,
-        viscous_loss=viscous,
-        impact_loss=losses.impact,
-        numerical_loss=numerical,
-        residual=change - (work - (viscous + losses.impact + numerical)),
+        change=flows.change,
+        work=flows.work,
+        viscous_loss=flows.viscous,
+        impact_loss=flows.impact,
+        numerical_loss=flows.numerical,
+        residual=flows.change - (flows.work - (flows.viscous + flows.impact + flows.numerical)),
     )

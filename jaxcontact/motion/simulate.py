@@ -15,10 +15,21 @@ from jax.core import Tracer
 
 from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
 from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed, refuse_closed
+from jaxcontact.motion.drive import (
+    StepDrive,
+    apply_drive,
+    at_start,
+    drive_of,
+    every_step,
+    shifted,
+    show_motion,
+)
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.nodal_fields import NodalFields
+from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
+from jaxcontact.motion.supports import Moves
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
@@ -39,6 +50,7 @@ def simulate(
     save_every: int = 1,
     checkpoint: Checkpoint | None = None,
     weak_contact: WeakContact | AlongDirection | None = None,
+    schedule: Schedule | None = None,
 ) -> Trajectory:
     """Simulate the motion of the body.
 
@@ -49,8 +61,9 @@ def simulate(
         stepper: from `prepare`.
         control: force density u, (T, N, d) [N/m^d], constant in a step and P1 in space; or in
             the unknowns of the system, (T, n), see `System.restrict_control`; or None.
-        steps: number of steps T; default the length of the control.
-        initial: state at time zero; default at rest without displacement.
+        steps: number of steps T; default the length of the control or of the schedule.
+        initial: state at time zero; default at rest without displacement. Where a schedule moves
+            clamped nodes, they follow the schedule from the start.
         save_every: number of steps k between recorded states, a divisor of T: displacement,
             velocity, gap and time then have T/k + 1 levels; contact records keep all T steps.
         checkpoint: `Checkpoint(segments)` lets the backward pass recompute the steps of a segment
@@ -58,6 +71,7 @@ def simulate(
         weak_contact: what the derivative means where gap and impulse of a pair are both zero:
             `ClosedBranch()` (default, Algorithm 1), `OpenBranch()`, `AlongDirection(control)`, or
             `CriticalCone()`, the exact one-sided derivative, in forward mode.
+        schedule: loads on facet sets, obstacles and supports that change in time.
 
     Returns:
         The trajectory of T steps.
@@ -70,11 +84,15 @@ def simulate(
             result is concrete; under jit, grad or vmap the trajectory is NaN from that step on
             instead.
 
-    Derivative: reverse mode of every order by control, initial state and every value of the
-    stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
+    Derivative: reverse mode of every order by control, initial state, schedule and every value of
+    the stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
     a `jax.custom_vjp`); at weak contact the derivative that it names.
     """
-    steps = check_steps(stepper, control, steps)
+    start, scheduled = stepper, None
+    if schedule is not None:
+        schedule, scheduled = check_schedule(stepper.system, schedule)
+        start, initial = at_start(stepper, schedule, initial)
+    steps = check_steps(stepper, control, steps, scheduled)
     if isinstance(save_every, bool) or save_every < 1 or steps % save_every:
         raise ValueError(
             f"save_every={save_every} must be a positive divisor of the number of steps, {steps}"
@@ -87,16 +105,20 @@ def simulate(
     if weak_contact is not None:
         kinds = (WeakContact, AlongDirection)
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
-    initial = check_initial(stepper, initial)
+    initial = check_initial(start, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
     if isinstance(weak_contact, AlongDirection):
-        stepper = _open_along(stepper, control, initial, steps, weak_contact)
+        stepper = _open_along(stepper, control, initial, steps, weak_contact, schedule)
         weak_contact = ClosedBranch()
     with _forward_mode_advice():
-        motion = _run(stepper, control, initial, weak_contact, steps, save_every, checkpoint)
+        motion, moves = _run(
+            stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule
+        )
     nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
-    trajectory = Trajectory(**motion._asdict(), nodal=nodal)
+    if schedule is not None and moves is not None:
+        nodal = show_motion(stepper.system, schedule, moves, nodal)
+    trajectory = Trajectory(**motion._asdict(), nodal=nodal, schedule=schedule)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
@@ -127,14 +149,22 @@ def _run(
     steps: int,
     save_every: int,
     checkpoint: Checkpoint | None,
-) -> _Motion:
+    schedule: Schedule | None,
+) -> tuple[_Motion, Moves | None]:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
+    drive = shapes = None
+    if schedule is not None:
+        drive, shapes = drive_of(system, dt, schedule)
+    first = system
+    if drive is not None and drive.shift is not None:
+        first = shifted(system, drive.shift[0])
+    assert initial.displacement is not None
     start = first_state(
         stepper.scheme,
         system,
         operators,
-        first_displacement(system, initial.displacement, weak_contact),
+        first_displacement(first, initial.displacement, weak_contact),
         system.restrict(initial.velocity),
     )
 
@@ -142,14 +172,18 @@ def _run(
         # One product with the basis for all steps, not one in each of them.
         control = control_loads(system, control)
 
-    def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation]):
-        force, perturbation = inputs
+    def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation, StepDrive | None]):
+        force, perturbation, driven = inputs
         load = system.load
         if force is not None:
             load = load + (force if system.basis is not None else system.control_load(force))
         load = load if perturbation.load is None else load + perturbation.load
+        now = system
+        if shapes is not None and driven is not None:
+            now, more = apply_drive(stepper.scheme, system, dt, shapes, driven)
+            load = load + more
         perturbed = perturbation.on(operators, dt)
-        result = stepper.scheme.step(system, perturbed, dt, state, load)
+        result = stepper.scheme.step(now, perturbed, dt, state, load)
         iterations, status, residual = _worst(result.solutions)
         result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
@@ -158,25 +192,30 @@ def _run(
             _record(dt, result.solutions),
         )
 
-    inputs = (control, stepper.perturbation)
+    inputs = (control, stepper.perturbation, None if drive is None else every_step(drive))
     states, (impulse, (iterations, status, residual), contact) = scan_steps(
         advance, start, inputs, steps, save_every, checkpoint
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
-    normal_displacement = jax.vmap(lambda y: system.normals @ y)(displacement)
-    return _Motion(
+    gap = system.gap[None, :] - jax.vmap(lambda y: system.normals @ y)(displacement)
+    moves = None
+    if drive is not None:
+        recorded = jax.tree.map(lambda x: x[::save_every], drive._replace(loads=None))
+        gap, moves = gap if recorded.shift is None else gap + recorded.shift, recorded.moves
+    motion = _Motion(
         dt=dt,
         time=dt * jnp.arange(0, steps + 1, save_every),
         unknowns=displacement,
         rates=jnp.concatenate([start.velocity[None], states.velocity]),
-        gap=system.gap[None, :] - normal_displacement,
+        gap=gap,
         contact_impulse=impulse,
         contact=contact,
         iterations=iterations,
         status=status,
         residual=residual,
     )
+    return motion, moves
 
 
 def _record(dt: Array, solutions: tuple[Solution, ...]) -> ContactRecord:
@@ -199,19 +238,27 @@ def _worst(solutions: tuple[Solution, ...]) -> tuple[Array, Array, Array]:
 
 
 def _open_along(
-    stepper: Stepper, control: Array | None, initial: State, steps: int, along: AlongDirection
+    stepper: Stepper,
+    control: Array | None,
+    initial: State,
+    steps: int,
+    along: AlongDirection,
+    schedule: Schedule | None,
 ) -> Stepper:
     """Return a stepper in whose derivative those weak pairs are open that a direction opens."""
     if along.control is not None and control is None:
         raise ValueError("AlongDirection(control) needs a control; give a control of zeros")
+    direction = along.initial
+    if isinstance(direction, State):
+        direction = direction.filled(jnp.zeros_like(stepper.system.points))
     # What the direction decides is constant for the gradient.
-    primals, directions = jax.lax.stop_gradient(
-        ((stepper, control, initial), (None, along.control, along.initial))
+    primals, directions, schedule = jax.lax.stop_gradient(
+        ((stepper, control, initial), (None, along.control, direction), schedule)
     )
     tangents = tuple(tangent_of(x, dx) for x, dx in zip(primals, directions, strict=True))
 
     def contact(stepper: Stepper, control: Array | None, initial: State) -> ContactRecord:
-        return _run(stepper, control, initial, CriticalCone(), steps, 1, None).contact
+        return _run(stepper, control, initial, CriticalCone(), steps, 1, None, schedule)[0].contact
 
     record, tangent = jax.jvp(contact, primals, tangents)
     is_open = record.weak & ~(tangent.multiplier > 0.0)

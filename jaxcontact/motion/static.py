@@ -35,6 +35,7 @@ from jaxcontact.motion.checks import KEEP_PAIR, SolveError, refuse_closed
 from jaxcontact.motion.stepper import choose_solvers, factorize
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.bodies import body_numbers
+from jaxcontact.system.rollers import hold
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import poison_unless
@@ -236,6 +237,7 @@ def _settle(system: System, problem: ContactProblem, pairs: Array) -> tuple[Arra
     def step(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
         y, p = state
         rest = system.load - system.stiffness @ y - normals.transposed_product(p, n)
+        rest = hold(system.rollers, rest)
         change, push = solve_on_cone(
             problem.matrix.values,
             normals.weights,
@@ -245,6 +247,7 @@ def _settle(system: System, problem: ContactProblem, pairs: Array) -> tuple[Arra
             rest,
             system.gap - normals @ y,
         )
+        change = hold(system.rollers, change)
         return (y + change, p + push), change
 
     start = jnp.zeros_like(system.load), jnp.zeros_like(system.gap)

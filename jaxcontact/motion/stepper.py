@@ -20,6 +20,7 @@ from jaxcontact.contact import (
 )
 from jaxcontact.linear import Factor, LinearSolver, check_memory, choose_linear_solver
 from jaxcontact.schemes import ContactImplicit, Operators, Scheme
+from jaxcontact.system.rollers import hold_matrix
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
 from jaxcontact.transforms.options import check_option
@@ -183,12 +184,13 @@ def factorize(
     linear_solver: LinearSolver,
     contact_solver: ContactSolver,
 ) -> ContactProblem:
-    """Return the contact problem of an SPD matrix with the contact normals of a system.
+    """Return the contact problem of an SPD matrix with contact normals and rollers of a system.
 
     Raises:
         ValueError: if the matrix is concrete and not positive definite, or the solvers do not fit
             each other.
     """
+    matrix = hold_matrix(system.rollers, matrix)
     frozen = jax.lax.stop_gradient((matrix.values, system.normals.weights))
     factor = linear_solver.factorize(
         SymmetricMatrix(frozen[0], matrix.columns),
@@ -196,7 +198,7 @@ def factorize(
         _unknown_coordinates(system),
     )
     _check_factor(factor)
-    return contact_problem(matrix, system.normals, factor, contact_solver)
+    return contact_problem(matrix, system.normals, factor, contact_solver, system.rollers)
 
 
 def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:
@@ -215,7 +217,8 @@ def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:
 
     def change(number: int, problem: ContactProblem) -> ContactProblem:
         del number
-        return contact_problem(problem.matrix, problem.normals, problem.form.factor, contact_solver)
+        parts = (problem.matrix, problem.normals, problem.form.factor)
+        return contact_problem(*parts, contact_solver, problem.rollers)
 
     return exchange(
         tree, Stepper, lambda stepper: replace(stepper, operators=stepper.operators.changed(change))

@@ -112,7 +112,7 @@ class Homotopy:
 
     finish: ExactFinish | None = field(default_factory=ExactFinish)
     """How the path ends in an exactly stationary control; None follows it to the last kappa. There
-    is no finish with bounds, or if the objective does not tell its motion."""
+    is no finish if the objective does not tell its motion."""
 
     finish_from: int = 6
     """Number of relaxed problems before the finish is tried."""
@@ -138,13 +138,14 @@ class Homotopy:
             return state, Ending.CERTIFIED
         motion = motion_of(problem)
         first = max(self.finish_from, 2)  # two levels tell where the path leads
-        finish = self.finish if problem.bounds is None and self.levels >= first else None
+        finish = self.finish if self.levels >= first else None
         if finish is not None and motion is not None:
             if state.level >= max(first, state.finish_level + 1):
                 return self._finished(problem, state, finish, motion), None
         if state.level == self.levels:
             return state, Ending.RELAXED
-        is_loose = finish is not None and motion is not None
+        # With bounds the finish may fail: which of them hold, the path tells less well.
+        is_loose = finish is not None and motion is not None and problem.bounds is None
         return self._next_level(problem, state, is_loose)
 
     def _next_level(

@@ -110,6 +110,8 @@ class WeakRows:
 
     def correct(self, gaps: np.ndarray) -> Array:
         """Return the shortest step that adds these gaps, (m,) [m], to those of the weak pairs."""
+        if not len(self.rows):
+            return jnp.zeros(self.rows.shape[1:], self.rows.dtype)
         inner = self._combinations.T @ gaps
         return jnp.tensordot(jnp.asarray(inner), self._basis, axes=1)
 
@@ -169,7 +171,9 @@ def weak_rows(
         responses.append(np.asarray(response)[: len(batch), is_weak])
     problem.counts.rows += len(places)
     if not rows:
-        return WeakRows(problem, jnp.zeros((0, *parameters.shape)), np.zeros((0, 0)), free)
+        return WeakRows(
+            problem, jnp.zeros((0, *parameters.shape), parameters.dtype), np.zeros((0, 0)), free
+        )
     return WeakRows(problem, jnp.concatenate(rows), np.concatenate(responses), free)
 
 

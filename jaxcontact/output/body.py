@@ -18,7 +18,7 @@ from jaxcontact.output.axes import import_matplotlib, label_plane, make_axes
 from jaxcontact.scene.cells import boundary_facets, facet_keys
 from jaxcontact.scene.facets import Facets
 from jaxcontact.scene.mesh import Mesh
-from jaxcontact.scene.scene import Scene
+from jaxcontact.scene.scene import Scene, contact_obstacles
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -196,7 +196,7 @@ def _draw_obstacles(scene: Scene, ax: Axes, low: np.ndarray, high: np.ndarray) -
     step = np.max(high - low) / OBSTACLE_GRID
     axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1)  # (V,H,d)
-    for name, obstacle in scene.contact.items():
+    for name, obstacle in contact_obstacles(scene):
         if isinstance(obstacle, Facets):
             continue
         phi = np.asarray(jax.vmap(jax.vmap(obstacle.signed_distance))(jnp.asarray(grid)))

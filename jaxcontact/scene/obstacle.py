@@ -52,7 +52,7 @@ class HalfSpace:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Ball:
-    """The ball (2D: disc) of the given centre and radius."""
+    """The ball (2D: disc) of the given centre and radius, or everything outside of it: a bowl."""
 
     center: Array | np.ndarray
     """Centre, (d,) [m]."""
@@ -60,10 +60,14 @@ class Ball:
     radius: float | Array
     """Radius, [m], positive."""
 
+    inside: bool = field(default=False, metadata={"static": True})
+    """Whether the body is inside and the obstacle outside of the ball."""
+
     @jax.jit
     def signed_distance(self, x: Array) -> Array:
         """Return the signed distance of one point (d,), a scalar [m]."""
-        return jnp.linalg.norm(x - jnp.asarray(self.center, x.dtype)) - self.radius
+        distance = jnp.linalg.norm(x - jnp.asarray(self.center, x.dtype)) - self.radius
+        return -distance if self.inside else distance
 
 
 @jax.tree_util.register_dataclass
@@ -110,8 +114,20 @@ def gap_and_normals(obstacle: Obstacle, points: Array) -> tuple[Array, Array]:
     gap, gradient = jax.vmap(jax.value_and_grad(obstacle.signed_distance))(points)
     if not is_traced(gradient):
         _check_slope(obstacle, np.linalg.norm(np.asarray(gradient), axis=1))
-    normals, factor = _normals(gradient, getattr(obstacle, "radius", 1.0))
+    normals, factor = _normals(gradient, smallest_radius(obstacle))
     return gap * factor, normals
+
+
+def simple_parts(obstacle: Obstacle) -> list[Obstacle]:
+    """Return the obstacles that an obstacle is made of, itself if it is made of none."""
+    parts = getattr(obstacle, "parts", ())
+    return [simple for part in parts for simple in simple_parts(part)] if parts else [obstacle]
+
+
+def smallest_radius(obstacle: Obstacle) -> Array | float:
+    """Return the smallest radius in an obstacle, one if there is none."""
+    radii = [getattr(part, "radius", 1.0) for part in simple_parts(obstacle)]
+    return radii[0] if len(radii) == 1 else jnp.min(jnp.stack([jnp.asarray(r) for r in radii]))
 
 
 # Without the gap, which may be traced where the normals are not.
@@ -134,8 +150,9 @@ def position_sizes(obstacle: Obstacle, points: Array) -> Array:
         points: contact nodes, (C, d) [m].
     """
     sizes = jnp.max(jnp.abs(points), axis=0)
-    for name in ("point", "center", "radius"):
-        sizes = jnp.maximum(sizes, jnp.abs(as_array(getattr(obstacle, name, 0.0))))
+    for part in simple_parts(obstacle):
+        for name in ("point", "center", "radius"):
+            sizes = jnp.maximum(sizes, jnp.abs(as_array(getattr(part, name, 0.0))))
     return sizes
 
 
@@ -156,13 +173,20 @@ def _check_slope(obstacle: Obstacle, slope: np.ndarray) -> None:
 
 
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
-    """Check what is concrete in an obstacle.
+    """Check what is concrete in an obstacle and its parts.
 
     Raises:
-        ValueError: if a vector has the wrong shape, a value is not finite, a normal is zero or a
-            radius is not positive.
+        ValueError: if it has no signed distance, a vector has the wrong shape, a value is not
+            finite, a normal is zero or a radius is not positive.
     """
-    for name in ("point", "normal", "center"):
+    for part in getattr(obstacle, "parts", ()):
+        check_obstacle(part, dimension)
+    if not callable(getattr(obstacle, "signed_distance", None)):
+        raise ValueError(
+            f"{obstacle!r} is no obstacle: it needs a method signed_distance, as jc.HalfSpace has; "
+            "contact with another body is jc.Facets(name), given to a contact set by itself"
+        )
+    for name in ("point", "normal", "center", "direction"):
         field_value = getattr(obstacle, name, None)
         if field_value is None:
             continue
@@ -174,7 +198,7 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
         if not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"{where} must be finite, got {value}")
         # np.asarray first: under jit the methods of a concrete JAX array give tracers.
-        if name == "normal" and not np.any(np.asarray(value)):
+        if name in ("normal", "direction") and not np.any(np.asarray(value)):
             raise ValueError(f"{where} must not be the zero vector")
     radius = as_array(getattr(obstacle, "radius", 1.0))
     if radius.shape != ():

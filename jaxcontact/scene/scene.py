@@ -35,9 +35,9 @@ class Scene:
     clamped: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the facet sets that are held at zero displacement."""
 
-    contact: Mapping[str, Obstacle | Facets] = field(default_factory=dict)
-    """Facet sets that may touch, with the obstacle that each may touch: a rigid one, or `Facets` of
-    another body."""
+    contact: Mapping[str, Obstacle | tuple[Obstacle, ...] | Facets] = field(default_factory=dict)
+    """Facet sets that may touch, with the obstacle that each may touch: a rigid one, a tuple of
+    rigid ones that each node may touch all, or `Facets` of another body."""
 
     traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
     """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
@@ -45,19 +45,25 @@ class Scene:
     body_force: Array | np.ndarray | None = None
     """Constant volume force, (d,) [N/m^d]; None is none."""
 
+    rollers: Mapping[str, Array | np.ndarray | None] = field(default_factory=dict)
+    """Facet sets whose nodes are held in one direction and slide freely across it, each a vector
+    (d,) of any positive length, or None for the normal of the facets: rollers, planes of symmetry,
+    slanted guides. A node on the edge of two sets, or of one set with an edge of more than 40
+    degrees, is held in the directions of both."""
+
 
 def check_scene(scene: Scene) -> None:
     """Check everything in a scene that is concrete.
 
     Raises:
         ValueError: if a name is not in the mesh, clamped and contact sets share nodes, two bodies
-            share nodes or constrain each other's facets, a vector has the wrong shape or is not
-            finite, or a material value is out of range.
+            share nodes or constrain each other's facets, a vector has the wrong shape, is not
+            finite or, of a roller, zero, or a material value is out of range.
     """
     mesh = scene.mesh
     if isinstance(scene.clamped, str):
         raise ValueError(f"clamped must be a tuple of names; write clamped=({scene.clamped!r},)")
-    for name in (*scene.clamped, *scene.contact, *scene.traction):
+    for name in (*scene.clamped, *scene.rollers, *scene.contact, *scene.traction):
         if name not in mesh.facets:
             raise ValueError(f"facet set {name!r} is not in the mesh; it has {sorted(mesh.facets)}")
     clamped = clamped_nodes(scene)
@@ -69,23 +75,51 @@ def check_scene(scene: Scene) -> None:
                 f"{shared.size} nodes, first {shared[:5].tolist()}; a clamped node cannot be in "
                 "contact: leave a row of facets between the two sets"
             )
+        if obstacle == ():
+            raise ValueError(f"contact[{name!r}] is an empty tuple; give it an obstacle")
         if isinstance(obstacle, Facets):
             check_facets(name, obstacle, mesh)
-        else:
-            check_obstacle(obstacle, mesh.dimension)
+            continue
+        for rigid in obstacle if isinstance(obstacle, tuple) else (obstacle,):
+            check_obstacle(rigid, mesh.dimension)
     check_each_interface_once(scene.contact, mesh)
     vectors = {f"traction[{name!r}]": vector for name, vector in scene.traction.items()}
     if scene.body_force is not None:
         vectors["body_force"] = scene.body_force
     for name, vector in vectors.items():
         _check_vector(name, vector, mesh.dimension)
+    for name, vector in scene.rollers.items():
+        if vector is None:
+            continue
+        _check_vector(f"rollers[{name!r}]", vector, mesh.dimension)
+        if not is_traced(vector) and not np.any(np.asarray(vector)):
+            raise ValueError(
+                f"rollers[{name!r}] must not be the zero vector; None takes the normals of the set"
+            )
     _check_materials(scene)
+
+
+def contact_obstacles(scene: Scene) -> list[tuple[str, Obstacle | Facets]]:
+    """Return every obstacle with the name of its contact set, in the order of the names."""
+    return [
+        (name, obstacle)
+        for name, value in sorted(scene.contact.items())
+        for obstacle in (value if isinstance(value, tuple) else (value,))
+    ]
 
 
 def clamped_nodes(scene: Scene) -> np.ndarray:
     """Return the sorted clamped nodes, (n_clamped,) int32."""
     sets = [np.ravel(scene.mesh.facets[name]) for name in scene.clamped]
     return np.unique(np.concatenate(sets)) if sets else np.zeros(0, np.int32)
+
+
+def clamped_numbers(scene: Scene) -> np.ndarray:
+    """Return the number of a clamped set that each node is in, (N,) int, -1 for none."""
+    numbers = np.full(scene.mesh.n_nodes, -1)
+    for number, name in enumerate(scene.clamped):
+        numbers[scene.mesh.facets[name]] = number
+    return numbers
 
 
 def cellwise_material(scene: Scene) -> KelvinVoigt:

@@ -60,6 +60,11 @@ class BackwardEuler:
         )
         return StepResult(y + dt * w, w, solution.multiplier, (solution,))
 
+    def force_of_step(self, system: System, old: Array, new: Array, inertia: Array) -> Array:
+        """Return the force at the end of the step, see `OwnForces`."""
+        del system, old
+        return new + inertia
+
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import ContactProblem, Guess, Solution
+from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 
@@ -126,13 +127,40 @@ class Scheme(Protocol):
         ...
 
 
+@runtime_checkable
+class OwnForces(Protocol):
+    """A scheme that does not take elastic forces at the middle of a step."""
+
+    def force_of_step(self, system: System, old: Array, new: Array, inertia: Array) -> Array:
+        """Return what stands for a force on its right-hand side; see `force_of_step`."""
+        ...
+
+
+def force_of_step(scheme: Scheme, system: System, old: Array, new: Array, inertia: Array) -> Array:
+    """Return the load (n,) [N] that stands in a step for elastic and inertia forces.
+
+    Args:
+        scheme: takes elastic forces at the middle of a step, if it has no `OwnForces`.
+        system: the system.
+        old: elastic force at the start of the step, (n,) [N].
+        new: at its end.
+        inertia: change of momentum per time, (n,) [N].
+    """
+    if isinstance(scheme, OwnForces):
+        return scheme.force_of_step(system, old, new, inertia)
+    return 0.5 * (old + new) + inertia
+
+
 def first_state(
     scheme: Scheme, system: System, operators: Operators, displacement: Array, velocity: Array
 ) -> StepState:
-    """Return the state at time zero, from y and v, (n,) each: nothing is in contact yet."""
+    """Return the state at time zero, from y and v, (n,) each: nothing is in contact yet.
+
+    Rollers take from it what they do not allow.
+    """
     return StepState(
-        displacement=displacement,
-        velocity=velocity,
+        displacement=hold(system.rollers, displacement),
+        velocity=hold(system.rollers, velocity),
         impulse=jnp.zeros(system.normals.count, system.dtype),
         guesses=tuple(problem.form.first_guess() for problem in operators.problems),
         carry=scheme.first_carry(system),

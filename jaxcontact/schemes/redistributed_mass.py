@@ -110,6 +110,11 @@ class RedistributedMass:
         velocity = w + jump - along_directions(directions, jump)
         return StepResult(y + dt * w, velocity, 4.0 * solution.multiplier, (solution,))
 
+    def force_of_step(self, system: System, old: Array, new: Array, inertia: Array) -> Array:
+        """Return the force at the middle, on massless rows that at the end; see `OwnForces`."""
+        change = inertia - 0.5 * (new - old)
+        return new + change - along_directions(contact_directions(system), change)
+
     def losses(
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -9,6 +10,9 @@ from jax import Array
 from scipy.sparse.csgraph import connected_components
 
 from jaxcontact.system.system import System
+
+#: Sums of squared cosines between an axis and the directions of rollers, above which they hold it.
+HELD = 1e-6
 
 
 def body_numbers(system: System) -> np.ndarray:
@@ -23,7 +27,8 @@ def body_numbers(system: System) -> np.ndarray:
 def free_flight_acceleration(system: System) -> Array:
     """Return the acceleration (n,) [m/s^2] of each body under the constant load.
 
-    It is that of the centre of mass, the load over the mass; zero for a body with clamped nodes.
+    It is that of the centre of mass, the load over the mass, as far as rollers do not hold it; zero
+    for a body with clamped nodes.
     """
     numbers = body_numbers(system)
     is_free = np.zeros(system.n_nodes, bool)
@@ -33,9 +38,13 @@ def free_flight_acceleration(system: System) -> Array:
         is_body = numbers == number
         if not np.all(is_free[is_body]):
             continue
-        for axis in np.eye(system.dimension):
-            field = jnp.asarray(is_body[:, None] * axis[None, :], system.dtype)
-            translation = system.restrict(field)
-            mass = jnp.dot(translation, system.mass @ translation)
-            acceleration += jnp.dot(translation, system.load) / mass * translation
+        fields = is_body[None, :, None] * np.eye(system.dimension)[:, None, :]
+        translations = system.restrict(jnp.asarray(fields, system.dtype))
+        mass = jnp.dot(translations[0], system.mass @ translations[0])
+        common = translations @ system.load / mass
+        if system.rollers is not None:
+            held = jax.vmap(lambda x: system.rollers @ x)(translations)
+            stiffness, axes = jnp.linalg.eigh(held @ held.T)
+            common = axes @ jnp.where(stiffness > HELD, 0.0, axes.T @ common)
+        acceleration += common @ translations
     return acceleration

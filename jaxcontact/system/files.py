@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jaxcontact.scene.material import KelvinVoigt
 from jaxcontact.system.basis import Basis
 from jaxcontact.system.pair_set import PairSet
+from jaxcontact.system.parts import ClampedSet, Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
 from jaxcontact.transforms.saved import load_dataclass
@@ -19,5 +21,5 @@ def load_system(path: str | Path) -> System:
         ValueError: if the file is damaged or holds something else.
         RuntimeError: if the system is in float64 while JAX has it switched off.
     """
-    kinds = (System, Basis, PairSet, ComponentwiseMatrix, ContactNormals, SymmetricMatrix)
-    return load_dataclass(path, kinds)
+    matrices = (ComponentwiseMatrix, ContactNormals, SymmetricMatrix)
+    return load_dataclass(path, (System, Basis, PairSet, Parts, ClampedSet, KelvinVoigt, *matrices))

@@ -64,7 +64,11 @@ class Meeting(NamedTuple):
     """Master nodes of each row, (C, m) int32; rows with fewer repeat their own slave node."""
 
     slots: np.ndarray
-    """Place of the nodes of each piece in the masters of its row, (Z, d) int32; m is none."""
+    """Place of the nodes of each piece in the masters of its row, (Z, d) int32; m + s for a node
+    of the clamped set s."""
+
+    held: np.ndarray
+    """Numbers of the clamped sets, (S,) int32."""
 
 
 class MortarRows(NamedTuple):
@@ -81,6 +85,9 @@ class MortarRows(NamedTuple):
 
     shares: Array | np.ndarray
     """Weights m_ik of the master nodes, (C, m)."""
+
+    held: Array | np.ndarray
+    """Sum of the weights of the nodes of each clamped set, (C, S)."""
 
 
 def mortar_rows(
@@ -129,11 +136,12 @@ def _rows(
     function = xp.einsum("za,zqa->zq", (size[:, None] * dual)[meeting.group], places)
     on_master = places @ xp.linalg.inv(corners)  # (z, q, b)
     parts = xp.einsum("zq,zq,zqb->zb", weights, function, on_master)
-    # Clamped masters have the slot m, which is cut off.
-    width = meeting.masters.shape[1] + 1
+    n_masters = meeting.masters.shape[1]
+    width = n_masters + len(meeting.held)
     slots = meeting.row[meeting.group][:, None] * width + meeting.slots
     shares = scatter(parts.reshape(-1), slots.reshape(-1), count * width)
-    return MortarRows(gap, normals, area, shares.reshape(count, width)[:, :-1] / area[:, None])
+    shares = shares.reshape(count, width) / area[:, None]
+    return MortarRows(gap, normals, area, shares[:, :n_masters], shares[:, n_masters:])
 
 
 _traced_rows = jax.jit(_rows)

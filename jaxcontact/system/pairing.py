@@ -31,7 +31,7 @@ CHUNK = 1_000_000
 
 
 def find_meeting(
-    names: Sequence[str], slave: np.ndarray, facets: Facets, mesh: Mesh, is_free: np.ndarray
+    names: Sequence[str], slave: np.ndarray, facets: Facets, mesh: Mesh, clamped_set: np.ndarray
 ) -> Meeting:
     """Return the facets that meet: one row for each node that sees the other body.
 
@@ -40,7 +40,8 @@ def find_meeting(
         slave: their facets, (F, d).
         facets: what they may touch.
         mesh: the mesh of both, with concrete `points` or `layout`.
-        is_free: nodes that are not clamped, (N,) bool; only these are masters.
+        clamped_set: number of the clamped set of each node, (N,) int, -1 for a free one; only free
+            nodes are masters.
 
     Raises:
         ValueError: if no concrete positions are known or no node sees the other body.
@@ -93,8 +94,9 @@ def find_meeting(
             f"{facets.name!r} along the contact direction; are both named right, and do the "
             "bodies face each other? Facets(name, along=direction) sets the direction"
         )
-    masters, slots = _tables(nodes[rows], row[group], master[other], is_free)
-    indices = (nodes[rows], master[hit[rows]], own, row, master[other], group, masters, slots)
+    masters, slots = _tables(nodes[rows], row[group], master[other], clamped_set)
+    held = np.arange(clamped_set.max() + 1)
+    indices = (nodes[rows], master[hit[rows]], own, row, master[other], group, masters, slots, held)
     return Meeting(*(np.asarray(index, np.int32) for index in indices))
 
 
@@ -200,17 +202,20 @@ def _matches(wanted: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _tables(
-    nodes: np.ndarray, row: np.ndarray, facets: np.ndarray, is_free: np.ndarray
+    nodes: np.ndarray, row: np.ndarray, facets: np.ndarray, clamped_set: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the free master nodes of each row (C, m), and the place of each corner (Z, d)."""
+    """Return the free master nodes of each row (C, m), and the place of each corner (Z, d).
+
+    The place of a clamped corner is m plus the number of its set.
+    """
     entries = np.stack([np.repeat(row, facets.shape[1]), facets.ravel()], axis=1)
     unique, inverse = np.unique(entries, axis=0, return_inverse=True)
-    free = is_free[unique[:, 1]]
+    free = clamped_set[unique[:, 1]] < 0
     before = np.cumsum(free) - free
     first = np.searchsorted(unique[:, 0], np.arange(nodes.size))
     slot = before - before[first[unique[:, 0]]]
     width = int(np.max(slot[free], initial=-1)) + 1
     masters = np.repeat(nodes[:, None], width, axis=1)
     masters[unique[free, 0], slot[free]] = unique[free, 1]
-    slots = np.where(free, slot, width)[inverse.reshape(-1)]
+    slots = np.where(free, slot, width + clamped_set[unique[:, 1]])[inverse.reshape(-1)]
     return masters, slots.reshape(facets.shape)

@@ -76,11 +76,15 @@ def reduce(
         controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced or reduced already, not exactly one of modes, frequency
-            and tolerance is given, or an argument is out of its range.
+        ValueError: if the system is traced, reduced already or has rollers, not exactly one of
+            modes, frequency and tolerance is given, or an argument is out of its range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
+    if system.rollers is not None:
+        raise ValueError(
+            "a system with rollers is not reduced; clamp the facet set, or use the full system"
+        )
     matrices = (system.mass, system.stiffness, system.viscosity, system.normals, system.load)
     if is_traced((matrices, system.nodal_mass, loads)):
         raise ValueError(

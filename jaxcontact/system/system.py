@@ -16,13 +16,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.scene import Scene, cellwise_material, check_scene, clamped_nodes, is_elastic
-from jaxcontact.system import assembly
 from jaxcontact.system.basis import Basis
-from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.control_space import control_loads, solve_mass
 from jaxcontact.system.lift import Lift
 from jaxcontact.system.pair_set import PairSet, pair_numbers
+from jaxcontact.system.parts import Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.saved import save_dataclass
@@ -51,7 +49,7 @@ class System:
 
     normals: ContactNormals
     """N, contact operator, (C, n); rows point from the body to the obstacle, or to the other body,
-    whose displacement they subtract."""
+    whose displacement they subtract. With rollers N P: they leave out what is held."""
 
     gap: Array
     """Initial gap psi of the contact pairs, (C,) [m]; negative means penetration."""
@@ -78,8 +76,17 @@ class System:
     node_numbers: np.ndarray
     """Position of each node among the free ones, (N,) int32; n/d for a clamped node."""
 
+    directions: Array
+    """Unit vector nu of each contact pair towards the obstacle or the other body, (C, d)."""
+
+    parts: Parts
+    """The facet sets, obstacles and clamped sets by name, for what changes in time."""
+
     dimension: int = field(metadata={"static": True})
     """Space dimension d."""
+
+    rollers: ContactNormals | None = None
+    """Orthonormal directions in which nodes are held by rollers, (H, n); None without rollers."""
 
     basis: Basis | None = None
     """Space of a reduced model (see `reduce`); None is all displacement components."""
@@ -159,6 +166,8 @@ class System:
             gap_rounding=take_rows(self.gap_rounding, kept),
             contact_nodes=take_rows(self.contact_nodes, kept),
             contact_area=take_rows(self.contact_area, kept),
+            directions=take_rows(self.directions, kept),
+            parts=self.parts.with_pairs(kept),
             basis=None if self.basis is None else self.basis.with_pairs(kept),
             open_pairs=PairSet.of(self, rest, self.open_pairs),
         )
@@ -194,7 +203,12 @@ class System:
         """Return the load (n,) [N] of a force density (N, d) or (n,) [N/m^d]: L u of MATH.md 1."""
         if control.ndim == 1:
             return self.l2_mass @ control
-        load = self.free_components(self.nodal_mass @ control)
+        return self.nodal_load(self.nodal_mass @ control)
+
+    @in_full_precision
+    def nodal_load(self, forces: Array) -> Array:
+        """Return the load (..., n) [N] of forces on the nodes (..., N, d) [N]."""
+        load = self.free_components(forces)
         return load if self.basis is None else load @ self.basis.vectors
 
     def restrict_control(self, control: Array) -> Array:
@@ -205,90 +219,3 @@ class System:
         adjoint state, which lies in the space.
         """
         return solve_mass(self.l2_mass, control_loads(self, control))
-
-
-@in_full_precision
-def discretize(scene: Scene, dtype=jnp.float64) -> System:
-    """Assemble the P1 system of a scene.
-
-    Traceable in material, obstacles, loads and node positions; the connectivity and the names
-    must be concrete. What cannot raise because it is traced makes the system NaN: a material out of
-    range, an inverted cell, an obstacle that is none.
-
-    Args:
-        scene: the scene.
-        dtype: floating point type, float64 or float32.
-
-    Returns:
-        The system, with n = d (number of nodes that are not clamped) unknowns.
-
-    Raises:
-        ValueError: if the scene is inconsistent (see `check_scene`) or leaves nothing to move.
-        RuntimeError: if float64 is asked for while JAX has it switched off.
-    """
-    dtype = jnp.dtype(dtype)
-    _check_dtype(dtype)
-    check_scene(scene)
-    mesh, dimension = scene.mesh, scene.mesh.dimension
-    points = jnp.asarray(mesh.points, dtype)
-    cells = np.asarray(mesh.cells)
-
-    is_free = np.ones(mesh.n_nodes, bool)
-    is_free[clamped_nodes(scene)] = False
-    free_nodes = np.flatnonzero(is_free).astype(np.int32)
-    if free_nodes.size == 0:
-        raise ValueError("every node is clamped; refine the mesh or clamp a smaller facet set")
-    numbers = np.where(is_free, np.cumsum(is_free) - 1, -1)
-
-    pattern = assembly.node_pattern(cells, numbers)
-    all_nodes = assembly.node_pattern(cells, np.arange(mesh.n_nodes))
-    values = assembly.scene_values(
-        points,
-        cells,
-        cellwise_material(scene),
-        pattern,
-        all_nodes,
-        free_nodes,
-        None if scene.body_force is None else jnp.asarray(scene.body_force, dtype),
-        {name: (mesh.facets[name], jnp.asarray(t, dtype)) for name, t in scene.traction.items()},
-        is_elastic=is_elastic(scene),
-    )
-    # Under jit too, what is concrete stays so and can be checked and compared.
-    with jax.ensure_compile_time_eval():
-        # In the digits of the mesh: a gap is a small difference of large positions.
-        pairs = contact_pairs(scene, as_array(mesh.points), is_free, dtype)
-        weights = jnp.asarray(pairs.row_weights(), dtype)
-    components = np.arange(dimension, dtype=np.int32)
-    rows = numbers[pairs.row_nodes].astype(np.int32)[:, :, None]
-    unknowns = (rows * dimension + components[None, None, :]).reshape(weights.shape)
-
-    def on_free(values: Array) -> SymmetricMatrix:
-        return SymmetricMatrix(values, pattern.columns)
-
-    return System(
-        mass=ComponentwiseMatrix(on_free(values.mass), dimension),
-        stiffness=on_free(values.stiffness),
-        viscosity=None if values.viscosity is None else on_free(values.viscosity),
-        l2_mass=ComponentwiseMatrix(on_free(values.l2_mass), dimension),
-        nodal_mass=SymmetricMatrix(values.nodal_mass, all_nodes.columns),
-        normals=ContactNormals(weights, unknowns, dimension * free_nodes.size),
-        gap=jnp.asarray(pairs.gap, dtype),
-        gap_rounding=jnp.asarray(pairs.rounding, dtype),
-        load=values.load,
-        contact_nodes=pairs.nodes,
-        contact_area=jnp.asarray(pairs.area, dtype),
-        points=points,
-        free_nodes=free_nodes,
-        node_numbers=np.where(is_free, numbers, free_nodes.size).astype(np.int32),
-        dimension=dimension,
-    )
-
-
-def _check_dtype(dtype) -> None:
-    if dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
-    if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            "float64 is switched off in JAX. Add jax.config.update('jax_enable_x64', True) at the "
-            "start of the program, or ask for discretize(scene, dtype=jnp.float32)"
-        )

@@ -20,7 +20,7 @@ STRUCTURE, VERSION = "structure", 1
 
 
 def save_dataclass(path: str | Path, node: Any) -> None:
-    """Write a dataclass of arrays, numbers, None and dataclasses of the same kind.
+    """Write a dataclass of arrays, numbers, None, and dataclasses and dictionaries of these.
 
     Raises:
         ValueError: if an array is traced.
@@ -70,6 +70,9 @@ def _take_apart(node: Any, name: str, arrays: dict[str, Any]) -> Any:
             for part in fields(node)
         }
         return {"kind": type(node).__name__, "parts": parts}
+    if isinstance(node, dict):
+        entries = {key: _take_apart(x, f"{name}[{key}]", arrays) for key, x in node.items()}
+        return {"entries": entries}
     if node is None or isinstance(node, bool | int | float | str):
         return {"value": node}
     arrays[name] = np.asarray(node)
@@ -82,6 +85,8 @@ def _put_together(structure: Any, arrays: Any, kinds: dict[str, type]) -> Any:
         return kinds[structure["kind"]](
             **{name: _put_together(part, arrays, kinds) for name, part in parts}
         )
+    if "entries" in structure:
+        return {key: _put_together(x, arrays, kinds) for key, x in structure["entries"].items()}
     if "value" in structure:
         return structure["value"]
     values = arrays[structure["array"]]

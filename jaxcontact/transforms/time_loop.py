@@ -119,9 +119,9 @@ def _scan_segments(
 
 def _split(tree: Tree, n: int) -> Tree:
     """Return leaves (n m, ...) as (n, m, ...)."""
-    return jax.tree.map(lambda x: x.reshape(n, -1, *x.shape[1:]), tree)
+    return jax.tree.map(lambda x: x.reshape(n, x.shape[0] // n, *x.shape[1:]), tree)
 
 
 def _join(tree: Tree) -> Tree:
     """Return leaves (n, m, ...) as (n m, ...)."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), tree)

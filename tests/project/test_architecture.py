@@ -20,6 +20,7 @@ LAYERS = (
     {"derivative"},
     {"optimize"},
     {"output"},
+    {"accuracy"},
     {"cli"},
 )
 RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}

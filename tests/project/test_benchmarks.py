@@ -20,6 +20,7 @@ RESULTS = {
     "contact_solvers": ["newton_cold_us", "newton_warm_us", "gauss_seidel_us"],
     "gradient_convergence": ["gradient"],
     "identification": ["median_miss", "median_gradients"],
+    "reduction": ["displacement_A", "gradient_A", "gradient_speedup"],
 }
 
 

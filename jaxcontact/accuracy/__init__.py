@@ -1,0 +1,1 @@
+"""How accurate a simulation is: the error of a reduced model, of mesh and time step; advice."""
