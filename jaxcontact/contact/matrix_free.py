@@ -84,6 +84,10 @@ class MatrixFreeContact:
         def violation(w: Array) -> Array:
             return normals @ w - bound
 
+        def size(w: Array, p: Array) -> Array:
+            # Of N w and of what the pressure takes from it: N w of closed pairs is rounding.
+            return _magnitude(normals, w) + jnp.max(compliance * jnp.abs(p), initial=0.0)
+
         def is_unfinished(search: _Search) -> Array:
             return ~search.is_repeated & (search.steps < limit)
 
@@ -91,9 +95,11 @@ class MatrixFreeContact:
         def advance(search: _Search) -> _Search:
             active = search.active
             w, p = self.factor.solve_constrained(active, rhs, bound)
-            noise = resolution + relative_tolerance * _magnitude(normals, w)
-            stays = active & (compliance * p >= -noise)
-            enters = ~active & (violation(w) > noise)
+            noise = resolution + relative_tolerance * size(w, p)
+            beyond = violation(w)
+            # Of pairs that depend on each other, the farther ones cannot be closed.
+            stays = active & (compliance * p >= -noise) & (beyond >= -noise)
+            enters = ~active & (beyond > noise)
             wrong = (stays | enters) ^ active
             steps, count = search.steps + 1, jnp.sum(wrong, dtype=jnp.int32)
             is_newton = steps < self.max_active_sets
@@ -111,7 +117,7 @@ class MatrixFreeContact:
         )
         active, w, p, _, is_repeated, steps = jax.lax.while_loop(is_unfinished, advance, start)
 
-        scale = _magnitude(normals, w) + resolution / relative_tolerance
+        scale = size(w, p) + resolution / relative_tolerance
         # Clipping a multiplier within the noise changes the balance of forces by as little.
         clipped = jnp.maximum(p, 0.0)
         error = jnp.abs(jnp.minimum(compliance * clipped, -violation(w)))

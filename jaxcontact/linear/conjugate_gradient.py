@@ -196,7 +196,9 @@ class ConjugateGradient:
     """Solve every step by preconditioned conjugate gradients; no factor is stored.
 
     Works with `SemismoothNewton`. Where contact pairs share unknowns, as between two bodies, one
-    dense C x C matrix of all C pairs is kept and inverted for every active set.
+    dense C x C matrix of all C pairs is kept and inverted for every active set. Equal pairs share
+    their force; steps with pairs that are almost equal, as of two planes that differ by less than
+    some 1e-3 in direction, may not converge: `NestedDissection` solves them.
     """
 
     tolerance: float = 1e-12

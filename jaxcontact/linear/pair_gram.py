@@ -5,8 +5,7 @@
 is what is left of a force x without the rows of an active set A. G is diagonal if no two rows share
 an unknown, as against obstacles; the rows of two bodies share those of the other one.
 
-Source: Gould, Hribar, Nocedal, SIAM J. Sci. Comput. 23 (2001); Newton's method for inverses:
-Schulz, Z. Angew. Math. Mech. 13 (1933) 57-59.
+Source: Gould, Hribar, Nocedal, SIAM J. Sci. Comput. 23 (2001).
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from jax import Array
 from jaxcontact.system.sparse import ContactNormals
 
 #: What is added to the unit diagonal of the scaled G before it is inverted, as a power of the unit
-#: roundoff, and the steps that take it out again: rows that depend on each other make G singular.
-#: The error of a singular value s is (e / s)^8, that of rounding eps / e.
-SHIFT, NEWTON_STEPS = 1 / 3, 3
+#: roundoff: rows that depend on each other make G singular. An error e / s in a direction of
+#: singular value s is left, and one of eps / e by rounding; a refinement squares them.
+SHIFT = 1 / 2
 
 
 @jax.tree_util.register_dataclass
@@ -49,8 +48,14 @@ class PairGram:
         """
         if self.matrix is None:
             return lambda q: jnp.where(active, q / self.diagonal, 0.0)
-        inverse = _inverse_on(self.matrix, active)
-        return lambda q: jnp.matmul(inverse, q, precision="highest")
+        matrix, inverse = self.matrix, _inverse_on(self.matrix, active)
+
+        def solve(q: Array) -> Array:
+            first = jnp.matmul(inverse, q, precision="highest")
+            rest = q - jnp.matmul(matrix, first, precision="highest")
+            return first + jnp.matmul(inverse, rest, precision="highest")
+
+        return solve
 
 
 @jax.jit
@@ -62,9 +67,6 @@ def _inverse_on(matrix: Array, active: Array) -> Array:
     shift = float(jnp.finfo(matrix.dtype).eps) ** SHIFT
     factor = jax.scipy.linalg.cho_factor(unit + shift * identity, lower=True)
     inverse = jax.scipy.linalg.cho_solve(factor, identity)
-    for _ in range(NEWTON_STEPS):
-        change = jnp.matmul(unit, inverse, precision="highest")
-        inverse = 2.0 * inverse - jnp.matmul(inverse, change, precision="highest")
     return jnp.where(inside, scale[:, None] * inverse * scale[None, :], 0.0)
 
 
