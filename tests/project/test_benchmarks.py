@@ -20,6 +20,7 @@ RESULTS = {
     "contact_solvers": ["newton_cold_us", "newton_warm_us", "gauss_seidel_us"],
     "gradient_convergence": ["gradient"],
     "identification": ["median_miss", "median_gradients"],
+    "two_bodies": ["stress_error", "pressure_error", "load_over_one_body", "two_over_one"],
     "reduction": ["displacement_A", "gradient_A", "gradient_speedup"],
 }
 
@@ -45,6 +46,8 @@ def test_benchmark_writes_what_it_measured(name, tmp_path, monkeypatch):
     assert record["machine"]["cores"] >= 1
     assert (tmp_path / f"{name}.png").stat().st_size > 1000
     for row in record["rows"]:
-        values = [row[column] for column in RESULTS[name]]
+        # The rows of one benchmark may answer several questions.
+        values = [row[column] for column in RESULTS[name] if column in row]
+        assert values
         assert np.all(np.isfinite(values))
         assert np.all(np.abs(values) > 0.0)
