@@ -99,13 +99,17 @@ def named_parts(
         clamped[name] = ClampedSet(
             nodes=sets[name],
             cells=np.asarray(mesh.cells)[touching],
-            material=_of_cells(material, touching),
+            material=_of_cells(material, touching, dtype),
             is_alone=np.asarray(shared.size == 0),
             shares=jnp.asarray(pairs.held[:, number], dtype),
         )
-    return Parts(dict(mesh.facets), end_signs(mesh.cells), obstacles, clamped)
+    return Parts(dict(mesh.facets), end_signs(mesh.cells).astype(dtype), obstacles, clamped)
 
 
-def _of_cells(material: KelvinVoigt, cells: np.ndarray) -> KelvinVoigt:
+def _of_cells(material: KelvinVoigt, cells: np.ndarray, dtype: np.dtype) -> KelvinVoigt:
     """Return the material of some cells, from scalars or from the values of all cells (E,)."""
-    return jax.tree.map(lambda x: x if np.ndim(x) == 0 else take_rows(as_array(x), cells), material)
+
+    def of_cells(x: Array) -> Array:
+        return jnp.asarray(x if np.ndim(x) == 0 else take_rows(as_array(x), cells), dtype)
+
+    return jax.tree.map(of_cells, material)

@@ -486,7 +486,12 @@ def test_discretize_is_differentiable_by_the_node_positions():
 def test_discretize_in_float32_makes_every_array_float32():
     floor = jc.HalfSpace(np.array([0.0, -1.0]), np.array([0.0, 1.0]))
     scene = jc.Scene(
-        SMALL_MESHES[2], MATERIAL, contact={"bottom": floor}, body_force=np.array([0.0, -1.0])
+        SMALL_MESHES[2],
+        MATERIAL,
+        clamped=("top",),
+        contact={"bottom": floor},
+        body_force=np.array([0.0, -1.0]),
     )
     leaves = jax.tree.leaves(jc.discretize(scene, dtype=jnp.float32))
-    assert {leaf.dtype for leaf in leaves} == {np.dtype("float32"), np.dtype("int32")}
+    expected = {np.dtype("float32"), np.dtype("int32"), np.dtype(bool)}
+    assert {leaf.dtype for leaf in leaves} == expected
