@@ -152,7 +152,7 @@ def batch(body: Body, reduced: jc.System, size: int, repeats: int) -> float:
     """Return the time per scene of a batch of controls over that of a single scene."""
     stepper, cost = jc.prepare(reduced, DT), tracking(reduced, body.target)
     c = reduced.restrict_control(body.loads["A"])
-    many = jnp.linspace(0.5, 1.5, size, dtype=c.dtype)[:, None, None] * c
+    many = jnp.linspace(0.5, 1.5, size, dtype=c.dtype)[:, None, None] * c[None]
     batched = jax.jit(jax.vmap(jax.value_and_grad(objective, argnums=2), in_axes=(None, None, 0)))
     seconds = measure.interleaved_seconds(
         {
