@@ -147,8 +147,8 @@ def bar_on_wall(h: float = 0.5) -> Scene:
 
     Length 10 in, E = 3e7 psi, density 7.3e-4 lbf s^2/in^4, area 1 in^2, gap .01 in to the wall on
     its left. Thrown at it with -202.2 in/s it touches after 4.946e-5 s, leaves at 1.481e-4 s, and
-    presses with 2.992e4 lbf in between. Source: Ansys verification manual, VM265 (with the density
-    that fits its results).
+    presses with 2.992e4 lbf in between. The density is that which fits these results.
+    Source: Ansys, Mechanical APDL Verification Manual (2013), VM265.
 
     Args:
         h: length of a cell, [in]; the default has 20.
