@@ -162,3 +162,12 @@ def test_gradient_in_unknowns_makes_no_array_of_the_mesh_and_the_steps(problem):
 def test_control_of_another_shape_is_refused(problem, shape):
     with pytest.raises(ValueError, match=r"or in unknowns \(T, n\)"):
         jc.simulate(problem.stepper, np.zeros(shape))
+
+
+def test_cost_sees_supports_that_move(problem):
+    # A moved support is no part of the unknowns: such a motion is compared on the nodes.
+    system, target = problem.full.system, problem.full.target
+    down = 0.01 * np.linspace(0.0, 1.0, len(target))[:, None] * np.array([0.0, -1.0])
+    motion = jc.simulate(problem.stepper, schedule=jc.Schedule(motion={"clamped": down}))
+    found = tracking(problem, problem.reduced)(motion)
+    agree(found, tracking(problem, system)(motion))
