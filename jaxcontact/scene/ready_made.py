@@ -115,8 +115,8 @@ def ball_on_plane(h: float = 1 / 8, gap: float = 0.0) -> Scene:
     by a Möbius transformation, which keeps angles and makes the cells at the lowest point nine
     times smaller. Pressed on the plane by a depth d (`System.with_gap`), it carries by Hertz
     4/3 E* d^(3/2), E* = E / (1 - nu^2), with a contact radius d^(1/2). For d from 0.0025 to 0.01
-    and h = 1/8, 1/12 (2460 and 7812 unknowns) the load is 12 to 15 % and 8 to 9 % higher: by the
-    mesh, of second order in h, and by 4 to 6 % since the clamp is not infinitely far away.
+    and h = 1/8, 1/12 (2460 and 7812 unknowns) the load is 12 to 15 % and 8 to 9 % higher, mostly by
+    the mesh.
 
     Args:
         h: mesh size before the map, [m].
