@@ -97,11 +97,7 @@ class TrackingCost:
         levels, *nodal = np.shape(self.distance.target)
         # The unknowns know nothing of supports that a schedule moves.
         is_moved = trajectory.schedule is not None and bool(trajectory.schedule.motion)
-        # Supports that move are no part of the unknowns.
-        are_fixed = trajectory.schedule is None or not trajectory.schedule.motion
-        is_reduced = (
-            self.reduced is not None and are_fixed and self.reduced.fits(trajectory.unknowns)
-        )
+        is_reduced = self.reduced is not None and self.reduced.fits(trajectory.unknowns)
         is_reduced = is_reduced and not is_moved
         motion = trajectory.unknowns if is_reduced else trajectory.displacement
         if np.shape(motion)[0] != levels or not (is_reduced or np.shape(motion)[1:] == (*nodal,)):
