@@ -124,6 +124,27 @@ def test_homotopy_without_contact_asks_for_kappa():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rings", "gradients", "products"), [(6, 60, 500), (12, 80, 700), (16, 80, 700)]
+)
+def test_homotopy_is_certified_on_every_mesh(rings, gradients, products):
+    problem = jc.scenes.half_disc_control(h=jc.scenes.RADIUS / rings)
+    result = jc.optimize(
+        problem.objective,
+        jnp.zeros_like(problem.reference),
+        method=jc.Homotopy(),
+        system=problem.system,
+        dt=problem.dt,
+    )
+    history, certificate = result.history, result.stationarity
+    assert result.status is jc.Ending.CERTIFIED
+    assert certificate.residual <= 1e-10 * history.gradient_norm[0]
+    assert certificate.is_strong
+    assert history.evaluations[-1] <= gradients
+    assert history.hessian_products[-1] <= products
+
+
+@pytest.mark.slow
 def test_homotopy_reaches_strong_stationarity_of_the_papers_problem():
     problem = jc.scenes.half_disc_control()
     result = jc.optimize(
