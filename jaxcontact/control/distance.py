@@ -60,10 +60,6 @@ class ReducedDistance:
     rest: Array
     """c, the part of the target outside of the space, (T+1,)."""
 
-    def fits(self, unknowns: Array) -> bool:
-        """Return whether these are unknowns of the model, by their number."""
-        return unknowns.shape[-1] == self.root.shape[1]
-
     def squares(self, unknowns: Array) -> Array:
         """Return the squared distances (T+1,) of unknowns (T+1, n)."""
         return jnp.sum((unknowns @ self.root.T - self.target) ** 2, axis=1) + self.rest

@@ -118,7 +118,9 @@ def simulate(
     nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(**motion._asdict(), nodal=nodal, schedule=schedule)
+    trajectory = Trajectory(
+        **motion._asdict(), nodal=nodal, schedule=schedule, mark=stepper.system.mark
+    )
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
