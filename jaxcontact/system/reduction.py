@@ -189,6 +189,17 @@ def _project(system: System, V: np.ndarray, pairs: np.ndarray, modes: int) -> Sy
         reduced = V.T @ (matrix.to_scipy().astype(float) @ V)
         return SymmetricMatrix(jnp.asarray(0.5 * (reduced + reduced.T), dtype), None)
 
+    def identity(factor: float) -> ComponentwiseMatrix:
+        return ComponentwiseMatrix(SymmetricMatrix(jnp.full((1, 1), factor, dtype), None), n)
+
+    l2_mass = project(system.l2_mass)
+    # With one density L is a multiple of M: no product with a matrix is needed.
+    factor = float(np.mean(l2_mass.diagonal()))
+    if np.allclose(
+        l2_mass.values, factor * np.eye(n), rtol=0, atol=64 * jnp.finfo(dtype).eps * factor
+    ):
+        l2_mass = identity(factor)
+
     def dense(normals: ContactNormals) -> ContactNormals:
         return ContactNormals(jnp.asarray(normals.to_scipy() @ V, dtype), None, n)
 
@@ -196,10 +207,10 @@ def _project(system: System, V: np.ndarray, pairs: np.ndarray, modes: int) -> Sy
     mark = mark_of(np.asarray(vectors))
     return dataclasses.replace(
         system,
-        mass=ComponentwiseMatrix(SymmetricMatrix(jnp.ones((1, 1), dtype), None), n),
+        mass=identity(1.0),
         stiffness=project(system.stiffness),
         viscosity=None if system.viscosity is None else project(system.viscosity),
-        l2_mass=project(system.l2_mass),
+        l2_mass=l2_mass,
         normals=dense(system.normals),
         load=jnp.asarray(np.asarray(system.load, float) @ V, dtype),
         basis=Basis(vectors, system.mass, system.normals, pairs, modes, mark),

@@ -222,3 +222,22 @@ def test_models_of_one_mark_are_stacked(problem, another):
     found = jax.vmap(lambda x: jc.simulate(x, SCALE * problem.nodal).displacement)(stacked)
     for stepper, motion in zip(steppers, found, strict=True):
         agree(motion, jc.simulate(stepper, SCALE * problem.nodal).displacement)
+
+
+@pytest.mark.parametrize("is_uniform", [True, False])
+def test_inner_product_needs_no_matrix_where_the_density_is_one_number(problem, is_uniform):
+    scene = problem.full.scene
+    heavier = scene.material.density * np.linspace(1.0, 2.0, len(scene.mesh.cells))
+    if not is_uniform:
+        scene = replace(scene, material=replace(scene.material, density=heavier))
+    reduced = jc.reduce(jc.discretize(scene), 6)
+    assert (sum(x.size for x in jax.tree.leaves(reduced.l2_mass)) == 1) == is_uniform
+    c = jnp.cos(jnp.arange(2.0 * reduced.size)).reshape(2, -1)
+    agree(jc.control_dot(reduced, 1.0, c, c), jc.control_dot(reduced, 1.0, *[reduced.lift(c)] * 2))
+    levels = problem.full.target[:2]
+    motion = jc.simulate(jc.prepare(reduced, problem.full.dt), SCALE * c[:1])
+    costs = [
+        jc.TrackingCost(system, target=levels, control_weight=1e9)(motion, control)
+        for system, control in ((reduced, c[:1]), (jc.discretize(scene), reduced.lift(c[:1])))
+    ]
+    agree(*costs)
