@@ -131,15 +131,8 @@ class Trajectory:
     time: Array
     """Time levels, (T+1,) [s]."""
 
-    unknowns: Array
-    """The unknowns of the system, (T+1, n): free displacement components [m], or coordinates in the
-    space of a reduced model [m kg^1/2]."""
-
-    rates: Array
-    """Velocity of the unknowns, (T+1, n)."""
-
     nodal: NodalFields
-    """What `displacement` and `velocity` are taken from."""
+    """Unknowns and nodal fields, displacement and velocity."""
 
     gap: Array
     """Distance to the obstacle along the normal, (T+1, C) [m]; never negative beyond rounding."""
@@ -161,6 +154,20 @@ class Trajectory:
 
     schedule: Schedule | None = None
     """What changed in time beside the control; `energy` reads it."""
+
+    @property
+    def unknowns(self) -> Array:
+        """The unknowns of the system, (T+1, n).
+
+        Free displacement components [m], or coordinates in the space of a reduced model
+        [m kg^1/2].
+        """
+        return self.nodal.unknowns
+
+    @property
+    def rates(self) -> Array:
+        """Velocity of the unknowns, (T+1, n)."""
+        return self.nodal.rates
 
     @property
     def displacement(self) -> Array:
