@@ -119,7 +119,8 @@ def simulate(
     nodal = NodalFields(stepper.system.lifting, values.pop("unknowns"), values.pop("rates"))
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule)
+    mark = stepper.system.mark
+    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule, mark=mark)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory

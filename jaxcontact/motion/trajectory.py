@@ -6,7 +6,7 @@ A motion is recorded in its unknowns, and nodal fields are lifted from them when
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -154,6 +154,9 @@ class Trajectory:
 
     schedule: Schedule | None = None
     """What changed in time beside the control; `energy` reads it."""
+
+    mark: str = field(default="", metadata={"static": True})
+    """What the unknowns stand for, `System.mark`."""
 
     @property
     def unknowns(self) -> Array:

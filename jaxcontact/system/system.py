@@ -100,6 +100,11 @@ class System:
         return self.load.shape[-1]
 
     @property
+    def mark(self) -> str:
+        """What the unknowns stand for: the fingerprint of the basis, empty for a full model."""
+        return "" if self.basis is None else self.basis.mark
+
+    @property
     def n_nodes(self) -> int:
         """Number of mesh nodes, N."""
         return self.points.shape[-2]
