@@ -32,7 +32,7 @@ def limits(
         tolerance: relative error that matters.
     """
     found = [
-        _strain(scene, trajectory),
+        _strain(scene, stepper, trajectory),
         _linearised_gap(scene, stepper, trajectory, tolerance),
         _contact_width(stepper, trajectory, h),
         _contact_steps(trajectory),
@@ -40,10 +40,13 @@ def limits(
     return tuple(sentence for sentence in found if sentence)
 
 
-def _strain(scene: Scene, trajectory: Trajectory) -> str:
+def _strain(scene: Scene, stepper: Stepper, trajectory: Trajectory) -> str:
     cells, points = np.asarray(scene.mesh.cells), np.asarray(scene.mesh.points)
     stride = max(len(trajectory.unknowns) // N_LEVELS, 1)
-    y = np.asarray(trajectory.displacement[::stride])
+    y = trajectory.displacement
+    if trajectory.frames is not None:
+        y = stepper.system.lift(trajectory.frames.deformation)
+    y = np.asarray(y[::stride])
     edges = points[cells[:, 1:]] - points[cells[:, :1]]  # (E, d, d)
     stretch = y[:, cells[:, 1:]] - y[:, cells[:, :1]]  # (K, E, d, d)
     # grad y of (edge, component): edges @ grad = stretch.
@@ -64,6 +67,8 @@ def _linearised_gap(
 ) -> str:
     """Compare kappa |y_t|^2 / 2 with the displacement that matters."""
     system = stepper.system
+    if system.frames is not None:
+        return ""
     nodes, y = np.asarray(system.contact_nodes), trajectory.displacement
     curvature = np.zeros(system.n_nodes)
     for name, obstacle in contact_obstacles(scene):

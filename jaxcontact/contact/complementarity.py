@@ -68,6 +68,9 @@ class Solution(NamedTuple):
     separation: Any = ()
     """b - N w, the velocity at which each pair separates, (C,); set by `ContactProblem.solve`."""
 
+    frames: Any = ()
+    """The frames of bodies that turn after the step, a `FrameState`; set by `TurningProblem`."""
+
     @property
     def weak(self) -> Array:
         """Pairs in weak contact, (C,) bool: active without a multiplier."""
