@@ -92,13 +92,11 @@ def _solve_bwd(residuals, cotangents):
         after, solution, _ = make_sweep(equation, fixed, form, frame, unknowns, guess)
         return after, solution.multiplier
 
-    _, by_unknowns = jax.vjp(lambda x: sweep(x, chosen), unknowns)
+    _, back = jax.vjp(sweep, unknowns, chosen)
     adjoint = _adjoint_sweeps(
-        lambda a: jax.tree.map(jnp.add, unknowns_bar, by_unknowns((a, multiplier_bar))[0]),
-        unknowns_bar,
+        lambda a: jax.tree.map(jnp.add, unknowns_bar, back((a, multiplier_bar))[0]), unknowns_bar
     )
-    _, by_data = jax.vjp(lambda x: sweep(unknowns, x), chosen)
-    (chosen_bar,) = by_data((adjoint, multiplier_bar))
+    _, chosen_bar = back((adjoint, multiplier_bar))
     values = iter(chosen_bar)
     leaves_bar = [next(values) if yes else None for yes in is_asked]
     return jax.tree.unflatten(tree, leaves_bar), None

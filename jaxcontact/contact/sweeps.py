@@ -223,8 +223,12 @@ def run_sweeps(equation: Equation, fixed: Fixed) -> tuple[Unknowns, Solution]:
         error = change * rate / (1.0 - rate)
         return _Search(unknowns, solution, change, error, search.steps + 1)
 
-    unknowns, solution, change = sweep(first, guess)
-    start = _Search(unknowns, solution, change, change, jnp.int32(1))
+    # Not made before the loop: the program would hold a sweep twice.
+    shapes = jax.eval_shape(sweep, first, guess)[1]
+    unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    unknown = unknown._replace(active=guess.active, workspace=guess.workspace)
+    infinite = jnp.full((), jnp.inf, dtype)
+    start = _Search(first, unknown, infinite, infinite, jnp.int32(0))
     found = jax.lax.while_loop(is_unfinished, advance, start)
     is_converged = found.error <= goal(found.unknowns)
     is_finite = jnp.isfinite(found.error)

@@ -61,6 +61,7 @@ class TurnedFactor:
 def turned_factor(nodal: CondensingFactor, weights: Array, places: np.ndarray) -> TurnedFactor:
     """Return the factor for contact rows (C, d) at the numbered contact nodes (C,)."""
     d = weights.shape[1]
-    blocks = nodal.compliance.reshape(-1, d, nodal.compliance.shape[0] // d, d)[places]
+    n_nodes = nodal.compliance.shape[0] // d
+    blocks = nodal.compliance.reshape(n_nodes, d, n_nodes, d)[places]
     rows = jnp.sum(weights[:, :, None, None] * blocks, axis=1)[:, places]
     return TurnedFactor(nodal, weights, places, jnp.sum(rows * weights[None], axis=2))

@@ -46,7 +46,7 @@ def frames_of(scene: Scene, system: System, pairs: ContactPairs) -> Frames | Non
     mass = system.mass.scalar @ jnp.ones(free.size, system.dtype)
     shares = mass * (members.T @ (1.0 / (members @ mass)))
     points = system.points[free]
-    origin = (members * shares) @ points
+    origin = members @ (shares[:, None] * points)
     inside = jnp.asarray(np.any(members > 0.0, axis=0))[:, None]
     reference = jnp.where(inside, points - members.T @ origin, 0.0)
     moments = jnp.concatenate([shares[:, None], system.mass.scalar @ reference], axis=1)

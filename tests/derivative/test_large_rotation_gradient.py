@@ -86,6 +86,7 @@ def test_nothing_of_the_sweeps_is_stored():
     assert per_step < 30 * n
 
 
+@pytest.mark.slow
 def test_batch_of_gradients_is_each_of_them():
     values = parameters(2)
     stepper, control, _ = hit(2, STABILIZED)

@@ -70,11 +70,12 @@ def test_free_flight_does_not_know_the_axes(dimension):
 
 
 def test_free_flight_converges_with_order_two():
-    reference = flight(2, 480, dt=DT / 8)[1].displacement[-1]
+    reference = flight(2, 960, dt=DT / 16)[1].displacement[-1]
     errors = [
         float(jnp.linalg.norm(flight(2, 60 * k, dt=DT / k)[1].displacement[-1] - reference))
-        for k in (1, 2)
+        for k in (2, 4)
     ]
+
     assert 3.5 < errors[0] / errors[1] < 5.0
     assert errors[1] < 2e-3
 
@@ -89,7 +90,7 @@ def test_rigid_body_turns_and_flies_as_one():
     motion = jc.simulate(stepper, steps=50, initial=start)
     time = np.asarray(motion.time)
     angle = np.arctan2(motion.rotation[:, 0, 1, 0], motion.rotation[:, 0, 0, 0])
-    np.testing.assert_allclose(angle, spin * time, rtol=2e-4)
+    np.testing.assert_allclose(angle, spin * time, rtol=2e-4, atol=1e-15)
     centre = points.mean(axis=0) + time[:, None] * velocity
     np.testing.assert_allclose(motion.centre[:, 0], centre, atol=1e-11)
 
@@ -144,18 +145,16 @@ def test_bodies_side_by_side_move_as_alone():
     parts = {
         "held": mesh.moved(translation=[5.0, 0.0]),
         "first": mesh,
-        "second": mesh.moved(rotation(2), [-5.0, 0.5]),
+        "second": mesh.moved(rotation(2), [-5.0, 0.0]),
     }
     material = jc.KelvinVoigt(young=1e5, poisson=0.3, bulk_viscosity=10.0, density=1000.0)
-    floor = jc.HalfSpace([0.0, -0.02], [0.0, 1.0])
+    floor = jc.HalfSpace([0.0, -0.002], [0.0, 1.0])
     rng = np.random.default_rng(0)
     velocity = {name: rng.normal(size=part.points.shape) for name, part in parts.items()}
     velocity["held"][np.unique(mesh.facets["top"])] = 0.0
 
     def scene(mesh, prefixes, **options):
-        names = [name for name in mesh.facets if name.startswith(prefixes)]
-        names = [name for name in names if not name.endswith("top")]
-        contact = dict.fromkeys(names, floor)
+        contact = dict.fromkeys((f"{name}/bottom" for name in prefixes), floor)
         return jc.Scene(mesh, material, contact=contact, body_force=[0.0, -9810.0], **options)
 
     def motion(scene, velocity):
@@ -301,7 +300,7 @@ def test_frames_are_asked_for_where_there_are_none():
 def test_state_that_penetrates_where_it_is_turned_is_refused():
     values = parameters(2)
     start = initial_of(values)
-    low = replace(start, displacement=start.displacement - jnp.array([0.0, 0.5]))
+    low = replace(start, displacement=start.displacement - jnp.array([[0.0, 0.5]]))
     with pytest.raises(ValueError, match="penetrates"):
         jc.simulate(stepper_of(2, values, STABILIZED), steps=1, initial=low)
 
