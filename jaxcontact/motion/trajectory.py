@@ -132,15 +132,8 @@ class Trajectory:
     time: Array
     """Time levels, (T+1,) [s]."""
 
-    unknowns: Array
-    """The unknowns of the system, (T+1, n): free displacement components [m], or coordinates in the
-    space of a reduced model [m kg^1/2]."""
-
-    rates: Array
-    """Velocity of the unknowns, (T+1, n)."""
-
     nodal: NodalFields
-    """What `displacement` and `velocity` are taken from."""
+    """Unknowns and nodal fields, displacement and velocity."""
 
     gap: Array
     """Distance to the obstacle along the normal, (T+1, C) [m]; never negative beyond rounding."""
@@ -190,6 +183,20 @@ class Trajectory:
         if self.frames is None:
             raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
         return self.frames
+
+    @property
+    def unknowns(self) -> Array:
+        """The unknowns of the system, (T+1, n).
+
+        Free displacement components [m], or coordinates in the space of a reduced model
+        [m kg^1/2].
+        """
+        return self.nodal.unknowns
+
+    @property
+    def rates(self) -> Array:
+        """Velocity of the unknowns, (T+1, n)."""
+        return self.nodal.rates
 
     @property
     def displacement(self) -> Array:

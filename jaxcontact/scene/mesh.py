@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -41,7 +40,7 @@ from jaxcontact.scene.mesh_checks import (
 )
 from jaxcontact.scene.quality import MeshQuality, mesh_quality
 from jaxcontact.scene.refine import edges_of, refine_cells, refine_facets, refine_points
-from jaxcontact.transforms.traced import as_array, is_traced
+from jaxcontact.transforms.traced import Values, as_array, is_traced
 
 __all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
 
@@ -160,7 +159,7 @@ class Mesh:
         if not is_traced(turn) and not _is_rotation(np.asarray(turn)):
             raise ValueError(f"rotation must be orthogonal with determinant 1, got {turn.tolist()}")
 
-        def move(x: Any) -> Any:
+        def move(x: Values) -> Values:
             # A product only where there is one: a translation leaves x @ 1 its digits.
             turned = x if rotation is None else x @ turn.T
             return turned + shift[None, :]
@@ -289,7 +288,7 @@ class Mesh:
         return components(self.cells, self.n_nodes)
 
 
-def _layout(points: Any, last: np.ndarray | None) -> np.ndarray | None:
+def _layout(points: Values, last: np.ndarray | None) -> np.ndarray | None:
     """Concrete positions as NumPy; the last ones if these are traced."""
     return last if isinstance(points, Tracer) else np.asarray(points)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from jaxcontact.scene.cells import cell_volumes, facet_keys
+from jaxcontact.transforms.traced import Values
 
 
 def match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:
@@ -35,10 +35,10 @@ def match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.nd
     return boundary[found]
 
 
-def as_points(points: ArrayLike) -> Any:
+def as_points(points: ArrayLike) -> Values:
     """Node positions as float64 NumPy, or as the JAX array they are, with their shape checked."""
     is_kept = isinstance(points, jax.Array) and jnp.issubdtype(points.dtype, jnp.floating)
-    array: Any = points if is_kept else np.array(points, dtype=np.float64)
+    array: Values = points if is_kept else np.array(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (1, 2, 3) or not len(array):
         raise ValueError(f"points have shape {array.shape}; pass 1, 2 or 3 coordinates per node")
     return array
@@ -80,7 +80,7 @@ def check_cells(cells: np.ndarray, n_nodes: int) -> None:
         raise ValueError(f"nodes {_listed(unused)} are in no cell: remove them ({advice})")
 
 
-def check_geometry(points: Any, cells: np.ndarray) -> None:
+def check_geometry(points: Values, cells: np.ndarray) -> None:
     """Raise if concrete positions are not finite or leave a cell without positive volume."""
     if isinstance(points, Tracer) or isinstance(cells, Tracer):
         return
