@@ -123,7 +123,8 @@ def stress(scene: Scene, displacement: ArrayLike, velocity: ArrayLike | None = N
                 "the viscous stress of bodies that turn is not known; with large_rotation=True "
                 "leave out the velocity"
             )
-        displacement = deformation(discretize(scene, jnp.result_type(displacement)), displacement)
+        displacement = jnp.asarray(displacement)
+        displacement = deformation(discretize(scene, displacement.dtype), displacement)
     return _stress(
         jnp.asarray(scene.mesh.points, jnp.result_type(displacement, jnp.float32)),
         np.asarray(scene.mesh.cells),

@@ -288,6 +288,17 @@ def test_functions_of_small_displacements_are_refused(call):
         call(system, jc.prepare(system, DT))
 
 
+def test_stress_is_that_of_the_deformation_in_the_axes_of_the_body():
+    scene, points = block(), np.asarray(MESHES[2].points)
+    stretch = 1e-3 * points @ np.array([[1.0, 0.5], [0.5, -0.3]])
+    turned = (points + stretch) @ rotation(2, 2.0).T - points + 3.0
+    np.testing.assert_allclose(
+        jc.stress(scene, turned).cells, jc.stress(scene, stretch).cells, atol=1e-6
+    )
+    with pytest.raises(ValueError, match="large_rotation"):
+        jc.stress(scene, turned, turned)
+
+
 def test_frames_are_asked_for_where_there_are_none():
     system = jc.discretize(block(large_rotation=False))
     motion = jc.simulate(jc.prepare(system, DT), steps=1)
