@@ -42,6 +42,7 @@ from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
 from jaxcontact.motion.linearization import linearization_error, turned_gap
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
+from jaxcontact.motion.momentum import Momentum, momentum
 from jaxcontact.motion.pressure import contact_pressure
 from jaxcontact.motion.schedule import Schedule, sample
 from jaxcontact.motion.simulate import simulate
@@ -127,6 +128,7 @@ __all__ = [
     "MemoryEstimate",
     "Mesh",
     "MeshQuality",
+    "Momentum",
     "NestedDissection",
     "NewtonCG",
     "OpenBranch",
@@ -181,6 +183,7 @@ __all__ = [
     "load_result",
     "load_system",
     "meshes",
+    "momentum",
     "optimize",
     "phase_mean",
     "plot",

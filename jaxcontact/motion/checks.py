@@ -14,6 +14,7 @@ from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.pair_set import Pairs, PairSet
+from jaxcontact.system.placing import placed
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced, poison_unless
@@ -164,6 +165,8 @@ def _penetration(system: System, displacement: Array) -> Array:
     if system.basis is not None:
         normals, rest = system.basis.normals, (system.gap_rounding, system.contact_nodes)
         pairs = PairSet(normals, system.gap, *rest)
+    elif system.frames is not None:
+        pairs = placed(system, system.free_components(displacement))
     return depth(pairs, system.free_components(displacement))
 
 

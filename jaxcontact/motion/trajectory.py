@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxcontact.motion.frame_motion import FrameMotion
 from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.scene.scene import Scene, clamped_nodes
@@ -144,7 +145,8 @@ class Trajectory:
     """How the contact problems of each step ended."""
 
     iterations: Array
-    """Iterations of the contact solver, (T,) int32; the most of a contact problem of the step."""
+    """Iterations of the contact solver, (T,) int32; the most of a contact problem of the step.
+    Where bodies turn, the sweeps of the step."""
 
     status: Array
     """`Status` of each step, (T,) int32; the worst of its contact problems."""
@@ -155,8 +157,35 @@ class Trajectory:
     schedule: Schedule | None = None
     """What changed in time beside the control; `energy` reads it."""
 
+    frames: FrameMotion | None = None
+    """The frames of the bodies that turn; None without them (see `Scene.large_rotation`)."""
+
     mark: str = field(default="", metadata={"static": True})
     """What the unknowns stand for, `System.mark`."""
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation of each body with a frame, (T+1, F, d, d).
+
+        Raises:
+            ValueError: if no body turns.
+        """
+        return self._frames.rotation
+
+    @property
+    def centre(self) -> Array:
+        """Mass centre of each body with a frame, (T+1, F, d) [m].
+
+        Raises:
+            ValueError: if no body turns.
+        """
+        return self._frames.centre
+
+    @property
+    def _frames(self) -> FrameMotion:
+        if self.frames is None:
+            raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
+        return self.frames
 
     @property
     def unknowns(self) -> Array:

@@ -76,11 +76,17 @@ def reduce(
         controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced, reduced already or has rollers, not exactly one of
-            modes, frequency and tolerance is given, or an argument is out of its range.
+        ValueError: if the system is traced, reduced already, has rollers or bodies that turn, not
+            exactly one of modes, frequency and tolerance is given, or an argument is out of its
+            range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
+    if system.frames is not None:
+        raise ValueError(
+            "modes of the reference configuration do not turn with a body; with "
+            "large_rotation=True use the full system"
+        )
     if system.rollers is not None:
         raise ValueError(
             "a system with rollers is not reduced; clamp the facet set, or use the full system"

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from jaxcontact.system.basis import Basis
 from jaxcontact.system.control_space import control_loads, solve_mass
+from jaxcontact.system.frames import Frames
 from jaxcontact.system.lift import Lift
 from jaxcontact.system.pair_set import PairSet, pair_numbers
 from jaxcontact.system.parts import Parts
@@ -94,6 +95,9 @@ class System:
     open_pairs: PairSet | None = None
     """Pairs that are taken to stay open (see `with_pairs`); None is none."""
 
+    frames: Frames | None = None
+    """The frames of the bodies that turn (see `Scene.large_rotation`); None is none."""
+
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
@@ -143,9 +147,11 @@ class System:
         If the writing fails or is killed, a file that was there before is still there.
 
         Raises:
-            ValueError: if the system is traced.
+            ValueError: if the system is traced, or bodies turn.
             OSError: if the file cannot be written.
         """
+        if self.frames is not None:
+            raise ValueError("a system with large_rotation=True holds obstacles; save its scene")
         save_dataclass(path, self)
 
     def with_pairs(self, pairs: ArrayLike) -> System:
@@ -160,8 +166,13 @@ class System:
                 `jnp.any(trajectory.active, axis=0)`, or their numbers; concrete.
 
         Raises:
-            ValueError: if the pairs are traced or are not among those of the system.
+            ValueError: if the pairs are traced or are not among those of the system, or bodies
+                turn.
         """
+        if self.frames is not None:
+            raise ValueError(
+                "with large_rotation=True any pair may come within reach; keep all of them"
+            )
         kept = pair_numbers(pairs, self.normals.count)
         rest = np.setdiff1d(np.arange(self.normals.count), kept)
         return replace(
