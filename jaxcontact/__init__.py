@@ -26,7 +26,7 @@ from jaxcontact.contact import (
 )
 from jaxcontact.control import scenes
 from jaxcontact.control.cost import TrackingCost, contact_force, contact_force_error, contact_time
-from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
+from jaxcontact.control.inner_product import Euclidean, control_dot, l2_value_and_grad
 from jaxcontact.derivative import (
     DerivativeReport,
     GradientCheck,
@@ -40,9 +40,11 @@ from jaxcontact.derivative import (
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
+from jaxcontact.motion.files import load_trajectory
 from jaxcontact.motion.linearization import linearization_error, turned_gap
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
 from jaxcontact.motion.pressure import contact_pressure
+from jaxcontact.motion.progress import Progress
 from jaxcontact.motion.schedule import Schedule, sample
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.static import StaticContact, solve_static
@@ -68,7 +70,6 @@ from jaxcontact.optimize import (
     boundary_actuator,
     descend,
     load_result,
-    optimize,
     stationarity,
 )
 from jaxcontact.scene import meshes
@@ -95,7 +96,12 @@ from jaxcontact.system.system import System
 from jaxcontact.transforms.time_loop import Checkpoint
 
 if TYPE_CHECKING:
+    from jaxcontact.optimize import optimize
     from jaxcontact.output import export, plot
+else:
+    from jaxcontact import optimize
+
+__version__ = "0.1.0"
 
 __all__ = [
     "LBFGS",
@@ -116,6 +122,7 @@ __all__ = [
     "Ending",
     "Energy",
     "ErrorEstimate",
+    "Euclidean",
     "ExactFinish",
     "Facets",
     "GradientCheck",
@@ -132,6 +139,7 @@ __all__ = [
     "OpenBranch",
     "Optax",
     "PhaseMean",
+    "Progress",
     "ProjectedGaussSeidel",
     "Recommendation",
     "RedistributedMass",
@@ -180,6 +188,7 @@ __all__ = [
     "linearization_error",
     "load_result",
     "load_system",
+    "load_trajectory",
     "meshes",
     "optimize",
     "phase_mean",
