@@ -61,12 +61,13 @@ class Progress:
             )
 
     def watch(
-        self, step: Callable[[State, Any], tuple[State, Any]], steps: int
-    ) -> tuple[Callable[[State, Any], tuple[State, Any]], Array]:
-        """Return a step that reports, and what must stand first in its inputs, (T,).
+        self, step: Callable[[State, Any], tuple[State, Any]], inputs: Any, steps: int
+    ) -> tuple[Any, Any]:
+        """Return a step that reports, and its inputs.
 
         Args:
             step: maps (state, inputs of the step) to (state, record).
+            inputs: of all steps.
             steps: number of all steps T.
         """
 
@@ -80,4 +81,4 @@ class Progress:
             jax.lax.cond(is_time, lambda: jax.debug.callback(send, done), lambda: None)
             return result
 
-        return watched, jnp.arange(1, steps + 1)
+        return watched, (jnp.arange(1, steps + 1), inputs)

@@ -199,11 +199,9 @@ def _run(
         )
 
     inputs = (control, stepper.perturbation, None if drive is None else every_step(drive))
-    if progress is not None:
-        advance, done = progress.watch(advance, steps)
-        inputs = (done, inputs)
+    loop = (advance, inputs) if progress is None else progress.watch(advance, inputs, steps)
     states, (impulse, (iterations, status, residual), contact) = scan_steps(
-        advance, start, inputs, steps, save_every, checkpoint
+        loop[0], start, loop[1], steps, save_every, checkpoint
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])

@@ -165,7 +165,7 @@ def prepare(
 def _is_positive(dt: object) -> bool:
     """Return whether a concrete value is one positive number."""
     number = np.asarray(dt)
-    return number.shape == () and number.dtype.kind in "iuf" and 0.0 < number < np.inf
+    return number.shape == () and number.dtype.kind in "iuf" and bool(0.0 < number < np.inf)
 
 
 def choose_solvers(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ Node = TypeVar("Node")
 
 def shown_by(
     facts: Callable[[Node], Mapping[str, object]],
-) -> tuple[Callable[[Node], str], Callable[[Node], str]]:
+) -> tuple[Any, Any]:
     """Return `__repr__` and `_repr_html_` of a class, made of what is worth to know by name.
 
     Args:
