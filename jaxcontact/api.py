@@ -1,12 +1,5 @@
-"""Dynamic contact of viscoelastic bodies in JAX, with exact gradients through the impact.
+"""The public names of the package, those of `import jaxcontact as jc`."""
 
-Shape comments use one letter per axis: N nodes, E or e cells, a b local nodes of a cell, d the
-space dimension, i j components, n unknowns, C contact pairs, T time steps. In a `Source:` the paper
-is Müller and Schiela (2017) and MATH.md lies in the folder notebooks/ of the repository.
-"""
-
-import importlib
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaxcontact import reference
@@ -38,6 +31,7 @@ from jaxcontact.derivative import (
     phase_mean,
 )
 from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
+from jaxcontact.motion.chatter import ChatterWarning
 from jaxcontact.motion.checks import SolveError
 from jaxcontact.motion.energy import Energy, energy
 from jaxcontact.motion.files import load_trajectory
@@ -97,11 +91,8 @@ from jaxcontact.transforms.time_loop import Checkpoint
 
 if TYPE_CHECKING:
     from jaxcontact.optimize import optimize
-    from jaxcontact.output import export, plot
 else:
     from jaxcontact import optimize
-
-__version__ = "0.1.0"
 
 __all__ = [
     "LBFGS",
@@ -110,6 +101,7 @@ __all__ = [
     "AlongDirection",
     "BackwardEuler",
     "Ball",
+    "ChatterWarning",
     "Checkpoint",
     "ClosedBranch",
     "ConjugateGradient",
@@ -182,7 +174,6 @@ __all__ = [
     "energy",
     "estimate_error",
     "estimate_memory",
-    "export",
     "join",
     "l2_value_and_grad",
     "linearization_error",
@@ -192,7 +183,6 @@ __all__ = [
     "meshes",
     "optimize",
     "phase_mean",
-    "plot",
     "prepare",
     "read_mesh",
     "recommend",
@@ -212,13 +202,3 @@ __all__ = [
 
 #: The first names of the two branches of the derivative.
 Strong, Inactive = ClosedBranch, OpenBranch
-
-#: Loaded when they are asked for: a simulation needs no pictures and no files.
-_LAZY = {"plot": "jaxcontact.output.plot", "export": "jaxcontact.output.export"}
-
-
-def __getattr__(name: str) -> ModuleType:
-    """Load `jc.plot` and `jc.export` on first use."""
-    if name in _LAZY:
-        return importlib.import_module(_LAZY[name])
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
