@@ -89,6 +89,14 @@ def test_release_has_one_version_and_date():
     assert cited["license"] == PROJECT["license"]
 
 
+def test_public_workflow_tests_three_systems_and_both_ends_of_the_versions():
+    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+    for word in ("ubuntu", "macos", "windows", "lowest-direct", "highest", "python -m pytest"):
+        assert word in workflow
+    lowest = PROJECT["requires-python"].removeprefix(">=")
+    assert f'"{lowest}"' in workflow
+
+
 @pytest.fixture(scope="module")
 def distributions(tmp_path_factory):
     """The folder with wheel and sdist; the wheel is made from the sdist."""
