@@ -23,4 +23,4 @@ def load_trajectory(path: str | Path) -> Trajectory:
         RuntimeError: if it is in float64 while JAX has it switched off.
     """
     saved = load_dataclass(path, (Trajectory, ContactRecord, Schedule, StoredFields, Lift))
-    return replace(saved, nodal=NodalFields.from_stored(saved.nodal, saved.unknowns, saved.rates))
+    return replace(saved, nodal=NodalFields.from_stored(saved.nodal))

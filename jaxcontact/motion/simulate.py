@@ -120,17 +120,18 @@ def simulate(
     with _forward_mode_advice():
         parts = (stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule)
         motion, moves = _run(*parts, progress)
-    nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
+    values = motion._asdict()
+    nodal = NodalFields(stepper.system.lifting, values.pop("unknowns"), values.pop("rates"))
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(**motion._asdict(), nodal=nodal, schedule=schedule)
+    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
 
 
 class _Motion(NamedTuple):
-    """A `Trajectory` without its nodal fields."""
+    """A `Trajectory` whose nodal fields are not lifted yet."""
 
     dt: Array
     time: Array

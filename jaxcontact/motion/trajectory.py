@@ -146,15 +146,8 @@ class Trajectory:
     time: Array
     """Time levels, (T+1,) [s]."""
 
-    unknowns: Array
-    """The unknowns of the system, (T+1, n): free displacement components [m], or coordinates in the
-    space of a reduced model [m kg^1/2]."""
-
-    rates: Array
-    """Velocity of the unknowns, (T+1, n)."""
-
     nodal: NodalFields
-    """What `displacement` and `velocity` are taken from."""
+    """Unknowns and nodal fields, displacement and velocity."""
 
     gap: Array
     """Distance to the obstacle along the normal, (T+1, C) [m]; never negative beyond rounding."""
@@ -196,6 +189,20 @@ class Trajectory:
         }
 
     __repr__, _repr_html_ = shown_by(_facts)
+
+    @property
+    def unknowns(self) -> Array:
+        """The unknowns of the system, (T+1, n).
+
+        Free displacement components [m], or coordinates in the space of a reduced model
+        [m kg^1/2].
+        """
+        return self.nodal.unknowns
+
+    @property
+    def rates(self) -> Array:
+        """Velocity of the unknowns, (T+1, n)."""
+        return self.nodal.rates
 
     @property
     def displacement(self) -> Array:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -38,7 +38,7 @@ from jaxcontact.scene.mesh_checks import (
 from jaxcontact.scene.quality import MeshQuality, mesh_quality
 from jaxcontact.scene.refine import edges_of, refine_cells, refine_facets, refine_points
 from jaxcontact.transforms.show import shown_by
-from jaxcontact.transforms.traced import is_traced
+from jaxcontact.transforms.traced import Values, is_traced
 
 if TYPE_CHECKING:
     import meshio
@@ -169,7 +169,7 @@ class Mesh:
         """
         turn, shift = as_motion(rotation, translation, self.dimension)
 
-        def move(x: Any) -> Any:
+        def move(x: Values) -> Values:
             # A product only where there is one: a translation leaves x @ 1 its digits.
             turned = x if rotation is None else x @ turn.T
             return turned + shift[None, :]
@@ -295,6 +295,6 @@ class Mesh:
     __repr__, _repr_html_ = shown_by(_facts)
 
 
-def _layout(points: Any, last: np.ndarray | None) -> np.ndarray | None:
+def _layout(points: Values, last: np.ndarray | None) -> np.ndarray | None:
     """Concrete positions as NumPy; the last ones if these are traced."""
     return last if isinstance(points, Tracer) else np.asarray(points)

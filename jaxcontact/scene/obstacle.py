@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.transforms.traced import as_array, is_traced, poison_unless
+from jaxcontact.transforms.trees import PyTree
 
 #: How far the slope of a signed distance may be from 1: grids and blends need a little.
 SLOPE_TOLERANCE = 1e-2
@@ -86,7 +87,7 @@ class SignedDistance:
     """Maps one point (d,) [m], and the parameters if there are any, to the signed distance of the
     point, a scalar [m]; written with jax.numpy."""
 
-    parameters: Any = None
+    parameters: PyTree = None
     """Second argument of the function, a pytree of arrays; None is none."""
 
     def signed_distance(self, x: Array) -> Array:

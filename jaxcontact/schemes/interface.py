@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxcontact.contact import ContactProblem, Guess, Solution
 from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
+from jaxcontact.transforms.trees import PyTree
 
 
 class SchemeMatrices(NamedTuple):
@@ -64,7 +65,7 @@ class StepState(NamedTuple):
     guesses: tuple[Guess, ...]
     """Where each contact problem starts: what the last step ended with."""
 
-    carry: Any = ()
+    carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
 
 
@@ -83,7 +84,7 @@ class StepResult(NamedTuple):
     solutions: tuple[Solution, ...]
     """Solutions of the contact problems, in the order of `Operators.problems`."""
 
-    carry: Any = ()
+    carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
 
     def state(self) -> StepState:
@@ -110,7 +111,7 @@ class Scheme(Protocol):
         """Return the mass matrix of the ledger and the matrices of the contact problems."""
         ...
 
-    def first_carry(self, system: System) -> Any:
+    def first_carry(self, system: System) -> PyTree:
         """Return what a step must remember beside the state, at the start; () for most schemes."""
         ...
 
