@@ -151,7 +151,7 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
                 trajectory,
                 path,
                 values=lambda level: jnp.linalg.norm(result.control[max(level - 1, 0)], axis=1),
-                label="magnitude of the control [MN/m² per metre of thickness]",
+                label="control [MN/m²]",
                 frames=40,
             )
         with output.writing("index.html") as path:

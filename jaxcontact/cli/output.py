@@ -31,11 +31,18 @@ class Output:
     written: list[str] = field(default_factory=list)
     """Names of the files so far, relative to the folder."""
 
+    found: set[str] = field(default_factory=set)
+    """Names of the files that were there before."""
+
+    def __post_init__(self) -> None:
+        """Look what is there."""
+        self.found = {path.name for path in self.folder.glob("*")}
+
     @contextlib.contextmanager
     def writing(self, name: str) -> Iterator[Path]:
         """Return the path for a file, and note it down once it is written."""
         path = self.folder / name
-        note = f"{name} (replaced)" if path.exists() else name
+        note = f"{name} (replaced)" if name in self.found else name
         yield path
         self.written.append(note)
 

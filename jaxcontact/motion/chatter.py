@@ -42,13 +42,15 @@ def chatter(trajectory: Trajectory) -> float:
     largest = np.max(np.abs(force), axis=0, initial=0.0)
     # Each change against the one before it: the smaller of both where they have other signs.
     pairs = np.minimum(np.abs(change[1:]), np.abs(change[:-1]))
-    is_turn = np.asarray((change[1:] * change[:-1] < 0.0) & (pairs >= SIZE * largest))
-    if len(is_turn) < CHANGES - 1:
+    is_turn = (change[1:] * change[:-1] < 0.0) & (pairs >= SIZE * largest)
+    if len(pairs) < CHANGES - 1:
         return 0.0
-    run = np.lib.stride_tricks.sliding_window_view(is_turn, CHANGES - 1, axis=0).all(axis=-1)
+    run: np.ndarray = np.lib.stride_tricks.sliding_window_view(is_turn, CHANGES - 1, axis=0).all(
+        axis=-1
+    )
     if not run.any():
         return 0.0
-    steps = np.arange(len(run))[:, None] + np.arange(CHANGES - 1)
+    steps = np.arange(len(pairs) - CHANGES + 2)[:, None] + np.arange(CHANGES - 1)
     worst = pairs[steps].max(axis=1)  # (W, C)
     return float(np.max(np.where(run, worst / np.where(largest, largest, 1.0), 0.0)))
 

@@ -77,7 +77,7 @@ def draw_figures(
     free = problem.simulate(jnp.zeros_like(problem.reference))
 
     def draw_control(ax: Axes) -> None:
-        scale = f"10$^{{{math.log10(problem.control_scale):g}}}$ N/m² per metre of thickness"
+        scale = f"10$^{{{math.log10(problem.control_scale):g}}}$ N/m²"
         plot.plot_control(
             mesh,
             result.control[step - 1],
@@ -97,8 +97,8 @@ def draw_figures(
         plot.plot_body(
             problem.scene,
             trajectory.displacement[step],
-            tensor.von_mises,
-            label="von Mises stress [N/m per metre of thickness]",
+            tensor.von_mises / 1e6,
+            label="von Mises stress [MN/m]",
             ax=ax,
         )
         ax.set_title(moment)

@@ -59,7 +59,8 @@ CAPTIONS = {
     "stress.png": (
         "The stress",
         "",
-        "Von Mises stress in plane strain at the same time, deformed to scale.",
+        "Von Mises stress in plane strain at the same time, per metre of thickness, deformed to "
+        "scale.",
     ),
     "energy.png": (
         "The energy",
