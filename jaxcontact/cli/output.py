@@ -111,7 +111,7 @@ class Keeper:
 
     def _write_history(self, path: Path, result: Result | None) -> None:
         if result is None:
-            columns = [self.values, self.norms, self.measured, [""] * len(self.values)]
+            columns = [self.values, self.norms, self.measured, [np.nan] * len(self.values)]
         else:
             history = result.history
             columns = [history.value, history.gradient_norm, self.distances, history.evaluations]

@@ -45,10 +45,9 @@ def chatter(trajectory: Trajectory) -> float:
     is_turn = (change[1:] * change[:-1] < 0.0) & (pairs >= SIZE * largest)
     if len(pairs) < CHANGES - 1:
         return 0.0
-    run: np.ndarray = np.lib.stride_tricks.sliding_window_view(is_turn, CHANGES - 1, axis=0).all(
-        axis=-1
-    )
-    if not run.any():
+    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(is_turn), CHANGES - 1, axis=0)
+    run = np.all(windows, axis=-1)
+    if not np.any(run):
         return 0.0
     steps = np.arange(len(pairs) - CHANGES + 2)[:, None] + np.arange(CHANGES - 1)
     worst = pairs[steps].max(axis=1)  # (W, C)

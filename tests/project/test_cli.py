@@ -1,8 +1,10 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 
 import jax.numpy as jnp
@@ -207,6 +209,24 @@ def test_half_disc_that_is_killed_in_the_optimisation_has_kept_control_and_histo
     monkeypatch.setattr(half_disc, "distance", die_in_the_third)
     with pytest.raises(SystemExit, match="9"):
         main([*TINY, "--out", str(tmp_path)])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGINT for other processes")
+@pytest.mark.parametrize("pause", [0.0, 0.1, 1.0])
+def test_half_disc_that_is_interrupted_twice_keeps_control_and_history(pause, tmp_path):
+    program = "import sys; from jaxcontact.cli import main; sys.exit(main())"
+    words = [*TINY[:-1], "1000000", "--method", "adam", "--out", str(tmp_path)]
+    with subprocess.Popen([sys.executable, "-c", program, *words]) as run:
+        while not (tmp_path / "control.npz").exists():
+            assert run.poll() is None
+            time.sleep(0.1)
+        for _ in range(2):
+            run.send_signal(signal.SIGINT)
+            time.sleep(pause)
+        assert run.wait() == 130
+    assert len(read_history(tmp_path)["value"]) > 1
+    assert np.load(tmp_path / "control.npz")["control"].any()
 
 
 def test_help_needs_no_jax():
