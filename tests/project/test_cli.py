@@ -218,7 +218,8 @@ def test_half_disc_that_is_interrupted_twice_keeps_control_and_history(pause, tm
     program = "import sys; from jaxcontact.cli import main; sys.exit(main())"
     words = [*TINY[:-1], "1000000", "--method", "adam", "--out", str(tmp_path)]
     with subprocess.Popen([sys.executable, "-c", program, *words]) as run:
-        while not (tmp_path / "control.npz").exists():
+        history = tmp_path / "history.csv"
+        while not history.exists() or history.read_text().count("\n") < 4:
             assert run.poll() is None
             time.sleep(0.1)
         for _ in range(2):
