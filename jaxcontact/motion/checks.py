@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -51,6 +52,8 @@ def check_steps(
                 f"steps={steps} does not fit a control of {np.shape(control)[0]} steps; leave "
                 "steps out or cut the control"
             )
+    if not isinstance(steps, Integral | None) or isinstance(steps, bool):
+        raise ValueError(f"steps must be a whole number, got {steps!r}")
     n_steps = np.shape(control)[0] if control is not None else scheduled if steps is None else steps
     if scheduled is not None and n_steps != scheduled:
         raise ValueError(
@@ -81,6 +84,11 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
     """
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
+    if not isinstance(initial, State | None):
+        raise ValueError(
+            f"initial must be a State, got a {type(initial).__name__}; write "
+            "initial=jc.State(displacement, velocity)"
+        )
     if initial is None or initial.displacement is None or initial.velocity is None:
         rest = jnp.asarray(np.zeros(shape, system.dtype))
         initial = (State() if initial is None else initial).filled(rest)

@@ -25,6 +25,7 @@ from jaxcontact.system.parts import Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.show import shown_by
 from jaxcontact.transforms.traced import as_array, take_rows
 
 
@@ -97,6 +98,19 @@ class System:
 
     frames: Frames | None = None
     """The frames of the bodies that turn (see `Scene.large_rotation`); None is none."""
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "dimension": self.dimension,
+            "unknowns": self.size,
+            "nodes": self.n_nodes,
+            "clamped_nodes": self.n_nodes - len(self.free_nodes),
+            "contact_pairs": self.normals.count,
+            "is_reduced": self.basis is not None,
+            "dtype": self.dtype.name,
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
     @property
     def size(self) -> int:
