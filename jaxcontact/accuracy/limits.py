@@ -35,7 +35,7 @@ def limits(
     """
     seen = _thinned(trajectory)
     found = [
-        _strain(scene, seen),
+        _strain(scene, stepper, seen),
         _linearised_gap(scene, seen, tolerance),
         _contact_width(stepper, trajectory, h),
         _contact_steps(trajectory),
@@ -46,14 +46,17 @@ def limits(
 def _thinned(trajectory: Trajectory) -> Trajectory:
     """Return the motion at about `N_LEVELS` of its time levels."""
     stride = max(len(trajectory.unknowns) // N_LEVELS, 1)
-    levels = (trajectory.unknowns, trajectory.rates, trajectory.gap, trajectory.nodal)
-    unknowns, rates, gap, nodal = jax.tree.map(lambda x: x[::stride], levels)
-    return replace(trajectory, unknowns=unknowns, rates=rates, gap=gap, nodal=nodal)
+    levels = (trajectory.gap, trajectory.nodal, trajectory.frames)
+    gap, nodal, frames = jax.tree.map(lambda x: x[::stride], levels)
+    return replace(trajectory, gap=gap, nodal=nodal, frames=frames)
 
 
-def _strain(scene: Scene, trajectory: Trajectory) -> str:
+def _strain(scene: Scene, stepper: Stepper, trajectory: Trajectory) -> str:
     cells, points = np.asarray(scene.mesh.cells), np.asarray(scene.mesh.points)
-    y = np.asarray(trajectory.displacement)
+    y = trajectory.displacement
+    if trajectory.frames is not None:
+        y = stepper.system.lift(trajectory.frames.deformation)
+    y = np.asarray(y)
     edges = points[cells[:, 1:]] - points[cells[:, :1]]  # (E, d, d)
     stretch = y[:, cells[:, 1:]] - y[:, cells[:, :1]]  # (K, E, d, d)
     # grad y of (edge, component): edges @ grad = stretch.
@@ -71,6 +74,8 @@ def _strain(scene: Scene, trajectory: Trajectory) -> str:
 
 def _linearised_gap(scene: Scene, trajectory: Trajectory, tolerance: float) -> str:
     """Compare the error of the linearised gap, where it can matter, with the tolerance."""
+    if trajectory.frames is not None:
+        return ""
     if trajectory.schedule is not None and trajectory.schedule.gap is not None:
         return ""
     errors = linearization_error(scene, trajectory)

@@ -10,12 +10,14 @@ Source: MATH.md 2.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
 from jax import Array
+
+from jaxcontact.transforms.trees import PyTree
 
 #: A step counts as solved if its KKT residual is below this multiple of the largest violation
 #: of the free motion, or below the rounding errors of the gap.
@@ -40,7 +42,7 @@ class Guess(NamedTuple):
     active: Array
     """Active set to start from, (C,) bool."""
 
-    workspace: Any = ()
+    workspace: PyTree = ()
     """What else the contact solver keeps, see `ContactSolver.first_workspace`."""
 
 
@@ -62,11 +64,14 @@ class Solution(NamedTuple):
     residual: Array
     """KKT residual relative to the largest violation of the free motion, scalar."""
 
-    workspace: Any = ()
+    workspace: PyTree = ()
     """What the contact solver hands to the next step; never differentiated."""
 
-    separation: Any = ()
+    separation: PyTree = ()
     """b - N w, the velocity at which each pair separates, (C,); set by `ContactProblem.solve`."""
+
+    frames: PyTree = ()
+    """The frames of bodies that turn after the step, a `FrameState`; set by `TurningProblem`."""
 
     @property
     def weak(self) -> Array:
@@ -99,7 +104,7 @@ class ContactSolver(Protocol):
         """Raise a ValueError if a concrete number that a pytree may not check itself is wrong."""
         ...
 
-    def first_workspace(self, compliance: Array) -> Any:
+    def first_workspace(self, compliance: Array) -> PyTree:
         """Return what the solver keeps between the steps of W, (C, C); () if nothing."""
         ...
 

@@ -19,6 +19,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jaxcontact.control.distance import NodalDistance, ReducedDistance, reduced_distance
+from jaxcontact.motion.chatter import warn_of_chatter
 from jaxcontact.motion.checks import check_control, check_every_step
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.assembly import nodal_areas
@@ -196,6 +197,8 @@ def _step_length(trajectory: Trajectory, dt: float | Array | None) -> Array:
 def contact_force(trajectory: Trajectory, *, dt: float | Array | None = None) -> Array:
     """Return the sum of all normal contact forces, the mean of each step, (T,) [N].
 
+    Where the forces are concrete and alternate from step to step, a `ChatterWarning` says so.
+
     Args:
         trajectory: T steps.
         dt: not needed; checked against the step length of the trajectory.
@@ -203,6 +206,7 @@ def contact_force(trajectory: Trajectory, *, dt: float | Array | None = None) ->
     Raises:
         ValueError: if dt is another one.
     """
+    warn_of_chatter(trajectory)
     return jnp.sum(trajectory.contact_impulse, axis=1) / _step_length(trajectory, dt)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxcontact.contact.closing_speed import closing_speed
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.transforms.trees import Tree, as_partial, exchange, nodes
+from jaxcontact.transforms.trees import PyTree, Tree, as_partial, exchange, nodes
 
 #: Phases that one period is sampled at.
 PHASES = 8
@@ -49,7 +48,7 @@ class PhaseMean:
     phases: int = field(default=PHASES, metadata={"static": True})
     """Number of motions, equally spaced over the period."""
 
-    def __call__(self, u: Any) -> Array:
+    def __call__(self, u: PyTree) -> Array:
         """Return the mean of J(u), a scalar, over gaps that differ by up to v dt / 2."""
         fractions = (jnp.arange(self.phases) + 0.5) / self.phases - 0.5
         return jnp.mean(jax.vmap(lambda x: moved(self.objective, x * self.speed)(u))(fractions))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -14,6 +15,7 @@ from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.pair_set import Pairs, PairSet
+from jaxcontact.system.placing import placed
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced, poison_unless
@@ -50,6 +52,8 @@ def check_steps(
                 f"steps={steps} does not fit a control of {np.shape(control)[0]} steps; leave "
                 "steps out or cut the control"
             )
+    if not isinstance(steps, Integral | None) or isinstance(steps, bool):
+        raise ValueError(f"steps must be a whole number, got {steps!r}")
     n_steps = np.shape(control)[0] if control is not None else scheduled if steps is None else steps
     if scheduled is not None and n_steps != scheduled:
         raise ValueError(
@@ -80,6 +84,11 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
     """
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
+    if not isinstance(initial, State | None):
+        raise ValueError(
+            f"initial must be a State, got a {type(initial).__name__}; write "
+            "initial=jc.State(displacement, velocity)"
+        )
     if initial is None or initial.displacement is None or initial.velocity is None:
         rest = jnp.asarray(np.zeros(shape, system.dtype))
         initial = (State() if initial is None else initial).filled(rest)
@@ -164,6 +173,8 @@ def _penetration(system: System, displacement: Array) -> Array:
     if system.basis is not None:
         normals, rest = system.basis.normals, (system.gap_rounding, system.contact_nodes)
         pairs = PairSet(normals, system.gap, *rest)
+    elif system.frames is not None:
+        pairs = placed(system, system.free_components(displacement))
     return depth(pairs, system.free_components(displacement))
 
 

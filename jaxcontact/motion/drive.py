@@ -188,7 +188,7 @@ def show_motion(
         nodes, axes = system.parts.clamped[name].nodes, slice(number * d, number * d + d)
         for kind, values in enumerate(moves):
             shown[kind] = shown[kind].at[:, nodes].set(values[:, None, axes])
-    return NodalFields.tree_unflatten(None, (shown[0], shown[1]))
+    return fields.shown(*shown)
 
 
 def flow_of_drive(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,7 +109,7 @@ def check_schedule(system: System, schedule: Schedule) -> tuple[Schedule, int]:
 
 
 def sample(
-    function: Callable[[Any], ArrayLike], stepper: Stepper, steps: int, *, levels: bool = False
+    function: Callable[[float], ArrayLike], stepper: Stepper, steps: int, *, levels: bool = False
 ) -> Array:
     """Return the values of a function of time as a control or a `Schedule` takes them.
 

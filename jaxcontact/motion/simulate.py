@@ -24,17 +24,21 @@ from jaxcontact.motion.drive import (
     shifted,
     show_motion,
 )
+from jaxcontact.motion.frame_motion import FrameMotion, check_frames, frame_motion
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.nodal_fields import NodalFields
+from jaxcontact.motion.progress import Progress
 from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.supports import Moves
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
+from jaxcontact.schemes.turning import make_step
 from jaxcontact.system.control_space import control_loads
-from jaxcontact.transforms.options import check_option
+from jaxcontact.system.placing import gap_and_rows
+from jaxcontact.transforms.options import check_kind, check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
 from jaxcontact.transforms.time_loop import Checkpoint, scan_steps
@@ -51,6 +55,7 @@ def simulate(
     checkpoint: Checkpoint | None = None,
     weak_contact: WeakContact | AlongDirection | None = None,
     schedule: Schedule | None = None,
+    progress: Progress | None = None,
 ) -> Trajectory:
     """Simulate the motion of the body.
 
@@ -72,6 +77,7 @@ def simulate(
             `ClosedBranch()` (default, Algorithm 1), `OpenBranch()`, `AlongDirection(control)`, or
             `CriticalCone()`, the exact one-sided derivative, in forward mode.
         schedule: loads on facet sets, obstacles and supports that change in time.
+        progress: `Progress(every, report)` reports the number of steps while they are made.
 
     Returns:
         The trajectory of T steps.
@@ -88,6 +94,7 @@ def simulate(
     the stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
     a `jax.custom_vjp`); at weak contact the derivative that it names.
     """
+    check_kind("simulate", stepper, Stepper, "stepper = jc.prepare(jc.discretize(scene), dt)")
     start, scheduled = stepper, None
     if schedule is not None:
         schedule, scheduled = check_schedule(stepper.system, schedule)
@@ -105,6 +112,9 @@ def simulate(
     if weak_contact is not None:
         kinds = (WeakContact, AlongDirection)
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
+    check_frames(stepper.system, schedule, weak_contact)
+    if progress is not None:
+        check_option("progress", progress, Progress, "Progress(every=100)")
     initial = check_initial(start, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
@@ -112,22 +122,21 @@ def simulate(
         stepper = _open_along(stepper, control, initial, steps, weak_contact, schedule)
         weak_contact = ClosedBranch()
     with _forward_mode_advice():
-        motion, moves = _run(
-            stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule
-        )
-    nodal = NodalFields(stepper.system.lifting, motion.unknowns, motion.rates)
+        parts = (stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule)
+        motion, moves = _run(*parts, progress)
+    values = motion._asdict()
+    nodal = NodalFields(stepper.system.lifting, values.pop("unknowns"), values.pop("rates"))
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(
-        **motion._asdict(), nodal=nodal, schedule=schedule, mark=stepper.system.mark
-    )
+    mark = stepper.system.mark
+    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule, mark=mark)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
 
 
 class _Motion(NamedTuple):
-    """A `Trajectory` without its nodal fields."""
+    """A `Trajectory` whose nodal fields are not lifted yet."""
 
     dt: Array
     time: Array
@@ -139,10 +148,11 @@ class _Motion(NamedTuple):
     iterations: Array
     status: Array
     residual: Array
+    frames: FrameMotion | None
 
 
 @in_full_precision
-@partial(jax.jit, static_argnames=("weak_contact", "steps", "save_every", "checkpoint"))
+@partial(jax.jit, static_argnames=("weak_contact", "steps", "save_every", "checkpoint", "progress"))
 def _run(
     stepper: Stepper,
     control: Array | None,
@@ -152,6 +162,7 @@ def _run(
     save_every: int,
     checkpoint: Checkpoint | None,
     schedule: Schedule | None,
+    progress: Progress | None = None,
 ) -> tuple[_Motion, Moves | None]:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
@@ -185,7 +196,7 @@ def _run(
             now, more = apply_drive(stepper.scheme, system, dt, shapes, driven)
             load = load + more
         perturbed = perturbation.on(operators, dt)
-        result = stepper.scheme.step(now, perturbed, dt, state, load)
+        result = make_step(stepper.scheme, now, perturbed, dt, state, load)
         iterations, status, residual = _worst(result.solutions)
         result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
@@ -195,12 +206,13 @@ def _run(
         )
 
     inputs = (control, stepper.perturbation, None if drive is None else every_step(drive))
+    loop = (advance, inputs) if progress is None else progress.watch(advance, inputs, steps)
     states, (impulse, (iterations, status, residual), contact) = scan_steps(
-        advance, start, inputs, steps, save_every, checkpoint
+        loop[0], start, loop[1], steps, save_every, checkpoint
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
-    gap = system.gap[None, :] - jax.vmap(lambda y: system.normals @ y)(displacement)
+    gap = jax.vmap(lambda y: gap_and_rows(system, y)[0])(displacement)
     moves = None
     if drive is not None:
         recorded = jax.tree.map(lambda x: x[::save_every], drive._replace(loads=None))
@@ -216,6 +228,7 @@ def _run(
         iterations=iterations,
         status=status,
         residual=residual,
+        frames=frame_motion(system, start, states, displacement),
     )
     return motion, moves
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
+
+from jaxcontact.transforms.traced import Values
 
 # Facet i of a cell is the one opposite its vertex i, oriented outward.
 _LOCAL_FACETS = {
@@ -18,7 +19,7 @@ _LOCAL_FACETS = {
 }
 
 
-def cell_volumes(points: Any, cells: np.ndarray) -> Any:
+def cell_volumes(points: Values, cells: np.ndarray) -> Values:
     """Signed volume det(x_1 - x_0, ..., x_d - x_0) / d! of every cell.
 
     Args:
@@ -34,7 +35,7 @@ def cell_volumes(points: Any, cells: np.ndarray) -> Any:
     return determinant / math.factorial(d)
 
 
-def _determinant(rows: list[list[Any]]) -> Any:
+def _determinant(rows: list[list[Values]]) -> Values:
     """Laplace expansion along the first row; the entries are arrays of one shape."""
     if len(rows) == 1:
         return rows[0][0]
@@ -79,7 +80,7 @@ def end_signs(cells: np.ndarray) -> np.ndarray:
     return np.asarray(counts[1] - counts[0], float)
 
 
-def area_vectors(points: Any, facets: np.ndarray, ends: Any) -> Any:
+def area_vectors(points: Values, facets: np.ndarray, ends: Values) -> Values:
     """Return outward normals of facets, as long as their areas, (F, d) [m^(d-1)].
 
     Args:
@@ -87,7 +88,7 @@ def area_vectors(points: Any, facets: np.ndarray, ends: Any) -> Any:
         facets: (F, d).
         ends: see `end_signs`.
     """
-    xp: Any = np if isinstance(points, np.ndarray) else jnp
+    xp: Values = np if isinstance(points, np.ndarray) else jnp
     d = points.shape[1]
     if d == 1:
         return xp.asarray(ends, points.dtype)[facets]

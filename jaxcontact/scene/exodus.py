@@ -9,6 +9,7 @@ Source: Schoof, Yarberry, EXODUS II: A Finite Element Data Model, SAND92-2137 (1
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,7 +106,7 @@ def read_exodus(path: Path) -> meshio.Mesh:
     )
 
 
-def _numbered(names: Any, start: str) -> list[str]:
+def _numbered(names: Iterable[str], start: str) -> list[str]:
     """Return the names `start` 1, 2, ... in this order."""
     found = [name for name in names if re.fullmatch(rf"{start}\d+", name)]
     return sorted(found, key=lambda name: int(name.removeprefix(start)))
@@ -118,7 +119,7 @@ def _shape(element_type: str, name: str) -> tuple[str, int]:
     return found
 
 
-def _names(values: dict[str, Any], kind: str, count: int) -> list[str]:
+def _names(values: dict[str, np.ndarray], kind: str, count: int) -> list[str]:
     """Return the names of blocks or sets; the number of one that has no name."""
     numbers = [str(k) for k in values.get(f"{kind}_prop1", np.arange(1, count + 1))]
     texts = [b"".join(row).split(b"\0")[0].decode() for row in values.get(f"{kind}_names", ())]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from jaxcontact.scene.cells import cell_volumes, facet_keys
+from jaxcontact.transforms.traced import Values, as_array, is_traced
 
 
 def match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:
@@ -35,10 +35,10 @@ def match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.nd
     return boundary[found]
 
 
-def as_points(points: ArrayLike) -> Any:
+def as_points(points: ArrayLike) -> Values:
     """Node positions as float64 NumPy, or as the JAX array they are, with their shape checked."""
     is_kept = isinstance(points, jax.Array) and jnp.issubdtype(points.dtype, jnp.floating)
-    array: Any = points if is_kept else np.array(points, dtype=np.float64)
+    array: Values = points if is_kept else np.array(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (1, 2, 3) or not len(array):
         raise ValueError(f"points have shape {array.shape}; pass 1, 2 or 3 coordinates per node")
     return array
@@ -68,6 +68,27 @@ def as_indices(array: ArrayLike, what: str, columns: tuple[int, ...], size: int)
     return indices.astype(np.int32)
 
 
+def as_motion(
+    rotation: ArrayLike | None, translation: ArrayLike | None, d: int
+) -> tuple[Values, Values]:
+    """A rotation (d,d) and a translation (d,) [m], checked; None is none."""
+    turn = np.eye(d) if rotation is None else as_array(rotation)
+    shift = np.zeros(d) if translation is None else as_array(translation)
+    if turn.shape != (d, d) or shift.shape != (d,):
+        raise ValueError(
+            f"a mesh of dimension {d} needs a rotation ({d}, {d}) and a translation ({d},), "
+            f"got {turn.shape} and {shift.shape}"
+        )
+    if is_traced(turn):
+        return turn, shift
+    matrix = np.asarray(turn)
+    # Up to rounding in float32.
+    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(d), atol=1e-5)
+    if not is_orthogonal or np.linalg.det(matrix) <= 0.0:
+        raise ValueError(f"rotation must be orthogonal with determinant 1, got {matrix.tolist()}")
+    return turn, shift
+
+
 def check_cells(cells: np.ndarray, n_nodes: int) -> None:
     """Raise if a cell names a node twice or a node is in no cell."""
     ordered = np.sort(cells, axis=1)
@@ -80,7 +101,7 @@ def check_cells(cells: np.ndarray, n_nodes: int) -> None:
         raise ValueError(f"nodes {_listed(unused)} are in no cell: remove them ({advice})")
 
 
-def check_geometry(points: Any, cells: np.ndarray) -> None:
+def check_geometry(points: Values, cells: np.ndarray) -> None:
     """Raise if concrete positions are not finite or leave a cell without positive volume."""
     if isinstance(points, Tracer) or isinstance(cells, Tracer):
         return

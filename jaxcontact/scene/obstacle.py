@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.transforms.traced import as_array, is_traced, poison_unless
+from jaxcontact.transforms.trees import PyTree
 
 #: How far the slope of a signed distance may be from 1: grids and blends need a little.
 SLOPE_TOLERANCE = 1e-2
@@ -86,7 +87,7 @@ class SignedDistance:
     """Maps one point (d,) [m], and the parameters if there are any, to the signed distance of the
     point, a scalar [m]; written with jax.numpy."""
 
-    parameters: Any = None
+    parameters: PyTree = None
     """Second argument of the function, a pytree of arrays; None is none."""
 
     def signed_distance(self, x: Array) -> Array:
@@ -172,6 +173,21 @@ def _check_slope(obstacle: Obstacle, slope: np.ndarray) -> None:
         )
 
 
+def _advice(value: object) -> str:
+    """Return what to write instead of something that is no obstacle."""
+    if isinstance(value, str):
+        return (
+            f"a facet set of another body of the mesh is jc.Facets({value!r}), and a plane is "
+            "jc.HalfSpace(point, normal)"
+        )
+    if callable(value):
+        return "a function that returns the signed distance of a point is jc.SignedDistance(...)"
+    return (
+        "it needs a method signed_distance, as jc.HalfSpace has; contact with another body is "
+        "jc.Facets(name), given to a contact set by itself"
+    )
+
+
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
     """Check what is concrete in an obstacle and its parts.
 
@@ -182,10 +198,7 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
     for part in getattr(obstacle, "parts", ()):
         check_obstacle(part, dimension)
     if not callable(getattr(obstacle, "signed_distance", None)):
-        raise ValueError(
-            f"{obstacle!r} is no obstacle: it needs a method signed_distance, as jc.HalfSpace has; "
-            "contact with another body is jc.Facets(name), given to a contact set by itself"
-        )
+        raise ValueError(f"{obstacle!r} is no obstacle: {_advice(obstacle)}")
     for name in ("point", "normal", "center", "direction"):
         field_value = getattr(obstacle, name, None)
         if field_value is None:

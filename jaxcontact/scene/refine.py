@@ -9,10 +9,11 @@ Source: Bey, Computing 55 (1995) 355-378; Kroeger, Preusser, Numer. Math. 109 (2
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+
+from jaxcontact.transforms.traced import Values
 
 #: The children of a cell: each corner is the middle of the edge between two corners of the parent.
 #: In 3D the last four share the diagonal from the middle of 02 to that of 13.
@@ -47,13 +48,13 @@ def edges_of(cells: np.ndarray) -> np.ndarray:
     return np.unique(np.concatenate([np.sort(cells[:, pair], axis=1) for pair in pairs]), axis=0)
 
 
-def refine_points(points: Any, edges: np.ndarray) -> Any:
+def refine_points(points: Values, edges: np.ndarray) -> Values:
     """Return the nodes with the middles of the edges after them, (N+K, d)."""
     middles = 0.5 * (points[edges[:, 0]] + points[edges[:, 1]])
     return (np if isinstance(points, np.ndarray) else jnp).concatenate([points, middles])
 
 
-def refine_cells(cells: np.ndarray, edges: np.ndarray, positions: Any) -> np.ndarray:
+def refine_cells(cells: np.ndarray, edges: np.ndarray, positions: Values) -> np.ndarray:
     """Return the 2^d children of every cell, (2^d E, d+1) int32, those of a cell one after another.
 
     Args:

@@ -14,7 +14,7 @@ import re
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def make_simplicial(path: Path, source: meshio.Mesh) -> None:
     """
     points = np.asarray(source.points, float)
     points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])]) if len(points) else points
-    blocks: list[tuple[str, Any]] = []
+    blocks: list[tuple[str, np.ndarray]] = []
     parents: list[np.ndarray | None] = []
     reduced, cut = Counter[str](), Counter[str]()
     for block in source.cells:
@@ -91,7 +91,7 @@ def make_simplicial(path: Path, source: meshio.Mesh) -> None:
 
 
 def _replace_cells(
-    source: meshio.Mesh, blocks: list[tuple[str, Any]], parents: list[np.ndarray | None]
+    source: meshio.Mesh, blocks: list[tuple[str, np.ndarray]], parents: list[np.ndarray | None]
 ) -> None:
     """Put blocks in the place of those of a mesh; `parents` are the old cells of the new ones."""
     source.cells = [

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import ContactProblem, Guess, Solution
+from jaxcontact.system.frames import FrameState, initial_frames
 from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
+from jaxcontact.transforms.trees import PyTree
 
 
 class SchemeMatrices(NamedTuple):
@@ -26,6 +28,10 @@ class SchemeMatrices(NamedTuple):
     """The SPD matrix of each contact problem of a step, (n, n). The first one is that whose
     solution is the contact at the end of the step."""
 
+    spans: tuple[float, ...] | None = None
+    """h / tau of each matrix M + h B + h^2 A; None if they are of another form, with which bodies
+    cannot turn."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -37,6 +43,9 @@ class Operators:
 
     problems: tuple[ContactProblem, ...]
     """The contact problems of a step, P of them, each with its matrix factorised."""
+
+    spans: tuple[float, ...] | None = field(default=None, metadata={"static": True})
+    """See `SchemeMatrices`."""
 
     @property
     def problem(self) -> ContactProblem:
@@ -64,8 +73,16 @@ class StepState(NamedTuple):
     guesses: tuple[Guess, ...]
     """Where each contact problem starts: what the last step ended with."""
 
-    carry: Any = ()
+    carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
+
+    frames: FrameState | None = None
+    """The frames of bodies that turn; None without them."""
+
+    @property
+    def deformation(self) -> Array:
+        """What the elastic energy is of, (n,) [m]: u in the frames, else y."""
+        return self.displacement if self.frames is None else self.frames.deformation
 
 
 class StepResult(NamedTuple):
@@ -83,13 +100,18 @@ class StepResult(NamedTuple):
     solutions: tuple[Solution, ...]
     """Solutions of the contact problems, in the order of `Operators.problems`."""
 
-    carry: Any = ()
+    carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
+
+    frames: FrameState | None = None
+    """The frames of bodies that turn; None without them."""
 
     def state(self) -> StepState:
         """Return what the next step starts from."""
         guesses = tuple(solution.guess for solution in self.solutions)
-        return StepState(self.displacement, self.velocity, self.impulse, guesses, self.carry)
+        return StepState(
+            self.displacement, self.velocity, self.impulse, guesses, self.carry, self.frames
+        )
 
 
 class Losses(NamedTuple):
@@ -110,7 +132,7 @@ class Scheme(Protocol):
         """Return the mass matrix of the ledger and the matrices of the contact problems."""
         ...
 
-    def first_carry(self, system: System) -> Any:
+    def first_carry(self, system: System) -> PyTree:
         """Return what a step must remember beside the state, at the start; () for most schemes."""
         ...
 
@@ -158,10 +180,17 @@ def first_state(
 
     Rollers take from it what they do not allow.
     """
+    guesses = tuple(problem.form.first_guess() for problem in operators.problems)
+    frames = None
+    if system.frames is not None:
+        frames = initial_frames(system.frames, displacement)
+        # What a contact solver keeps is of a compliance, which turns from step to step.
+        guesses = tuple(Guess(guess.active) for guess in guesses)
     return StepState(
         displacement=hold(system.rollers, displacement),
         velocity=hold(system.rollers, velocity),
         impulse=jnp.zeros(system.normals.count, system.dtype),
-        guesses=tuple(problem.form.first_guess() for problem in operators.problems),
+        guesses=guesses,
         carry=scheme.first_carry(system),
+        frames=frames,
     )

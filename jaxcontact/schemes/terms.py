@@ -65,6 +65,11 @@ def _gap_resolution(pairs: Pairs, y: Array, largest: Array) -> Array:
     return jax.lax.stop_gradient(rounding)
 
 
+def elastic_force(system: System, state: StepState) -> Array | float:
+    """Return A y, (n,) [N]; zero with frames, whose contact problem holds the force, MATH.md 12."""
+    return system.stiffness @ state.displacement if state.frames is None else 0.0
+
+
 def viscous_loss(system: System, dt: Array, increment: Array) -> Array:
     """Return tau w.Bw, the energy [J] that the viscosity takes from the increment tau w (n,)."""
     if system.viscosity is None:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,9 +34,7 @@ from jax import Array
 
 from jaxcontact.scene.cells import area_vectors
 from jaxcontact.system.block_matrix import scatter
-from jaxcontact.transforms.traced import is_traced
-
-Values = Any  # a NumPy or a JAX array
+from jaxcontact.transforms.traced import Values, is_traced
 
 
 class Meeting(NamedTuple):

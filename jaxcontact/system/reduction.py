@@ -76,11 +76,16 @@ def reduce(
         controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced or reduced already, not exactly one of modes, frequency
-            and tolerance is given, or an argument is out of its range.
+        ValueError: if the system is traced, reduced already or has bodies that turn, not exactly
+            one of modes, frequency and tolerance is given, or an argument is out of its range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
+    if system.frames is not None:
+        raise ValueError(
+            "modes of the reference configuration do not turn with a body; with "
+            "large_rotation=True use the full system"
+        )
     matrices = (system.mass, system.stiffness, system.viscosity, system.normals, system.load)
     if is_traced((matrices, system.nodal_mass, loads)):
         raise ValueError(

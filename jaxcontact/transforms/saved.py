@@ -19,7 +19,7 @@ from jaxcontact.transforms.traced import is_traced
 STRUCTURE, VERSION = "structure", 1
 
 
-def save_dataclass(path: str | Path, node: Any) -> None:
+def save_dataclass(path: str | Path, node: object) -> None:
     """Write a dataclass of arrays, numbers, None, and dataclasses and dictionaries of these.
 
     Raises:
@@ -62,7 +62,7 @@ def load_dataclass(path: str | Path, kinds: Iterable[type]) -> Any:
         ) from error
 
 
-def _take_apart(node: Any, name: str, arrays: dict[str, Any]) -> Any:
+def _take_apart(node: object, name: str, arrays: dict[str, np.ndarray]) -> dict:
     """Return the structure of a node; its arrays go into the dictionary."""
     if is_dataclass(node):
         parts = {

@@ -10,6 +10,8 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
+from jaxcontact.transforms.trees import PyTree
+
 
 def instantiate(tangent: Array | SymbolicZero) -> Array:
     """Return a tangent or cotangent as an array, also if it is a symbolic zero."""
@@ -19,7 +21,7 @@ def instantiate(tangent: Array | SymbolicZero) -> Array:
     return tangent
 
 
-def tangent_of(primal: Any, tangents: Any) -> Any:
+def tangent_of(primal: PyTree, tangents: PyTree) -> PyTree:
     """Return the tangent of a pytree from those of its floating point leaves; None is zero."""
     leaves, structure = jax.tree.flatten(primal)
     given = iter([None] * len(leaves) if tangents is None else jax.tree.leaves(tangents))

@@ -6,7 +6,7 @@ then: multiplication carries the NaN into the derivatives too, where `jnp.where`
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,9 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 Tree = TypeVar("Tree")
+
+#: A NumPy or a JAX array, for functions that keep the kind they get.
+Values: TypeAlias = Any
 
 
 def is_traced(tree: object) -> bool:
@@ -28,7 +31,7 @@ def as_array(value: ArrayLike | list[Array]) -> Array | np.ndarray:
     return jnp.asarray(value) if is_traced(value) else np.asarray(value)
 
 
-def take_rows(values: Array | np.ndarray, numbers: np.ndarray) -> Any:
+def take_rows(values: Values, numbers: np.ndarray) -> Values:
     """Return values[numbers], concrete if the values are, also under jit."""
     if is_traced(values):
         return values[numbers]
@@ -36,7 +39,7 @@ def take_rows(values: Array | np.ndarray, numbers: np.ndarray) -> Any:
         return values[numbers]
 
 
-def join_rows(first: Array | np.ndarray, second: Array | np.ndarray) -> Any:
+def join_rows(first: Values, second: Values) -> Values:
     """Return both arrays one after the other, concrete if both are, also under jit."""
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         return np.concatenate([first, second])

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 from jax.tree_util import Partial
+
+#: Any nesting of arrays that JAX takes apart.
+PyTree: TypeAlias = Any
 
 Tree = TypeVar("Tree")
 Node = TypeVar("Node")

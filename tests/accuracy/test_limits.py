@@ -46,7 +46,7 @@ def test_large_strains_are_told_with_their_place(gentle):
 
 
 def _scaled(motion, factor):
-    return type(motion.nodal)(lambda x: factor * x, motion.displacement, motion.velocity)
+    return motion.nodal.shown(factor * motion.displacement, factor * motion.velocity)
 
 
 def test_a_narrow_and_a_short_contact_are_told(gentle):

@@ -38,6 +38,19 @@ def test_nodal_fields_that_nobody_asks_for_are_not_made(body):
     assert str((9, *control.shape[1:])).replace(" ", "") not in str(program).replace(" ", "")
 
 
+def test_a_body_without_clamped_nodes_is_recorded_once():
+    bar = jc.Scene(
+        jc.meshes.interval(1.0, h=0.25), jc.KelvinVoigt(young=1.0, poisson=0.0), contact={}
+    )
+    stepper = jc.prepare(jc.discretize(bar), 0.1)
+    motion = jax.jit(lambda: jc.simulate(stepper, steps=3))()
+    assert sum(x.shape[:1] == (4,) and x.size >= 20 for x in jax.tree.leaves(motion)) == 2
+    difference = jax.tree.map(lambda a, b: a - b, motion.nodal, motion.nodal)
+    assert difference.displacement.shape == motion.displacement.shape == (4, 5, 1)
+    shapes = jax.eval_shape(lambda: jc.simulate(stepper, steps=3))
+    assert shapes.velocity.shape == (4, 5, 1)
+
+
 def test_trajectories_are_pytrees_with_nodal_fields(body):
     stepper, control = body
     motion = jc.simulate(stepper, control)
