@@ -68,13 +68,13 @@ class HostSystem(NamedTuple):
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
-        return self.allowed.shape[1]
+        return self.mass.diagonal().size
 
 
 def _allowed_motions(system: System) -> csr_array:
     """Return an orthonormal basis of what the rollers of a system allow."""
     if system.rollers is None:
-        return scipy.sparse.eye_array(system.size, format="csr")
+        return csr_array(scipy.sparse.eye_array(system.size))
     d, rows = system.dimension, np.asarray(system.rollers.weights, float)
     node = np.asarray(system.rollers.unknowns)[:, 0] // d
     blocks = [np.eye(d)] * (system.size // d)
