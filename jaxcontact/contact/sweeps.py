@@ -65,6 +65,12 @@ class Equation(NamedTuple):
     bound: Array
     """b, (C,)."""
 
+    places: Array
+    """Places of the contact nodes at the start of the step, (C, d) [m]."""
+
+    more: Array
+    """What b is larger by than the distance over tau, (C,) [m/s]."""
+
     span: Array
     """h, scalar [s]."""
 
@@ -113,8 +119,9 @@ def make_sweep(
     guess: Guess,
 ) -> tuple[Unknowns, Solution, Array]:
     """Make one sweep (6); return the new unknowns, the solution of its VI and |x|."""
-    matrix, mass, stiffness, frames, state, weights, rhs, bound, h, dt = equation
+    matrix, mass, stiffness, frames, state, *_, rhs, _, _, _, h, dt = equation
     w, increment = unknowns
+    weights, bound = contact_at(equation, fixed, w)
     shape = frames.reference.shape
     places = turned_places(frames, state)
     step, increment = turn(frames, state.rotation, places, dt, w.reshape(shape), increment)
@@ -125,7 +132,11 @@ def make_sweep(
     g = turned_force(frames, step, force.reshape(shape))
     rest = (rhs - products[:, 0]).reshape(shape) - g
     rest = frames.apply(jnp.swapaxes(frame, 1, 2), rest, 1.0).reshape(-1)
-    turned = ContactNormals(_turned_rows(frames, weights, frame, fixed), fixed.unknowns, w.size)
+    rows = _turned_rows(frames, weights, frame, fixed)
+    if frames.is_concave:
+        form = turned_form(form, jax.lax.stop_gradient(rows))
+        guess = form.first_guess()._replace(active=guess.active)
+    turned = ContactNormals(rows, fixed.unknowns, w.size)
     normals = ContactNormals(weights, fixed.unknowns, w.size)
     problem = ContactProblem(
         matrix,
@@ -138,6 +149,23 @@ def make_sweep(
     x, solution = problem.solve(rest, Bound(bound - normals @ w, fixed.resolution), guess)
     change = frames.apply(frame, x.reshape(shape), 1.0).reshape(-1)
     return Unknowns(w + change, increment), solution, jnp.max(jnp.abs(x))
+
+
+def contact_at(equation: Equation, fixed: Fixed, velocity: Array) -> tuple[Array, Array]:
+    """Return the rows of N (C, d) and b (C,) at a velocity w (n,).
+
+    A node that meets a concave obstacle has them at its new place, where the tangent is in front
+    of the obstacle: b = phi(x') / tau + nu' . w. All others keep them.
+    """
+    weights, bound, dt = equation.weights, equation.bound, equation.dt
+    for meeting in equation.frames.meetings:
+        if meeting.is_concave:
+            pairs = meeting.pairs
+            w = velocity[fixed.unknowns[pairs]]
+            distance, normals = meeting.measure(equation.places[pairs] + dt * w)
+            reached = distance / dt + jnp.sum(normals * w, axis=1) + equation.more[pairs]
+            weights, bound = weights.at[pairs].set(normals), bound.at[pairs].set(reached)
+    return weights, bound
 
 
 def _turned_rows(frames: Frames, weights: Array, frame: Array, fixed: Fixed) -> Array:

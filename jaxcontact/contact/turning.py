@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
 from jaxcontact.contact.sweep_adjoint import solve_by_sweeps
-from jaxcontact.contact.sweeps import Equation, Fixed, turned_form
+from jaxcontact.contact.sweeps import Equation, Fixed, contact_at, turned_form
 from jaxcontact.contact.vi import Bound, ContactProblem
 from jaxcontact.system.frames import Frames, FrameState, next_frames, turn, turned_places
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
@@ -39,6 +39,12 @@ class TurningProblem:
     velocity: Array
     """Where the sweeps start, (n,)."""
 
+    places: Array
+    """Places of the contact nodes at the start of the step, (C, d) [m]."""
+
+    more: Array
+    """What b is larger by than the distance over tau, (C,) [m/s]."""
+
     span: Array
     """h, scalar [s]."""
 
@@ -58,6 +64,7 @@ class TurningProblem:
         """
         shift, push, *_ = self.problem.perturbation
         value = bound.value if shift is None else bound.value + shift
+        more = self.more if shift is None else self.more + shift
         normals = self.problem.normals
         assert normals.unknowns is not None
         if push is not None:
@@ -71,6 +78,8 @@ class TurningProblem:
             normals.weights,
             rhs,
             value,
+            self.places,
+            more,
             self.span,
             self.dt,
         )
@@ -94,10 +103,11 @@ class TurningProblem:
             w.reshape(places.shape),
             unknowns.increment,
         )
+        weights, value = contact_at(equation, fixed, w)
         multiplier = solution.multiplier if push is None else solution.multiplier + push
         return w, solution._replace(
             multiplier=multiplier * poison,
-            separation=value - normals @ w,
+            separation=value - ContactNormals(weights, normals.unknowns) @ w,
             frames=next_frames(self.frames, self.state, self.dt, step, increment),
         )
 

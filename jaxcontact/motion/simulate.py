@@ -32,6 +32,7 @@ from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.supports import Moves
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
+from jaxcontact.motion.turned_bodies import warn_of_rotation
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
 from jaxcontact.schemes.turning import make_step
@@ -78,6 +79,9 @@ def simulate(
 
     Returns:
         The trajectory of T steps.
+
+    Warns if the result is concrete and a body without clamped nodes has turned by more than five
+    degrees without `Scene.large_rotation`.
 
     Raises:
         ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
@@ -126,6 +130,7 @@ def simulate(
     trajectory = Trajectory(**values, nodal=nodal, schedule=schedule)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
+        warn_of_rotation(stepper.system, motion.unknowns, save_every)
     return trajectory
 
 

@@ -14,7 +14,7 @@ have R = S = I and wbar = W = y = 0. Source: MATH.md 12.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -42,6 +42,14 @@ class Meeting:
 
     nodes: np.ndarray
     """Their nodes, (P,) int32."""
+
+    is_concave: bool = field(metadata={"static": True})
+    """Whether it is concave, a bowl: a node is kept out of it by the tangent at its new place."""
+
+    def measure(self, places: Array) -> tuple[Array, Array]:
+        """Return the distances (P,) [m] of the nodes at places (P, d), and the normals (P, d)."""
+        distance, slope = jax.vmap(jax.value_and_grad(self.obstacle.signed_distance))(places)
+        return distance, -slope / jnp.linalg.norm(slope, axis=1, keepdims=True)
 
 
 @jax.tree_util.register_dataclass
@@ -77,6 +85,11 @@ class Frames:
 
     meetings: tuple[Meeting, ...]
     """Which pairs meet which obstacle; the gaps of bodies without frame stay linearised."""
+
+    @property
+    def is_concave(self) -> bool:
+        """Whether an obstacle is concave."""
+        return any(meeting.is_concave for meeting in self.meetings)
 
     def sums(self, left: Array, right: Array) -> Array:
         """Return sum left right^T over the nodes of each body, (F, i, j), of (K, i) and (K, j)."""

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.scene.facets import Facets
+from jaxcontact.scene.obstacle import Ball
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.bodies import body_numbers
 from jaxcontact.system.contact_pairs import merged_obstacles
@@ -71,7 +72,8 @@ def _meetings(scene: Scene, pairs: ContactPairs, has_frame: np.ndarray) -> Itera
     for number, (_, obstacle, _) in enumerate(merged_obstacles(scene)):
         rows = np.flatnonzero(has_frame & (pairs.owner == number)).astype(np.int32)
         if rows.size and not isinstance(obstacle, Facets):
-            yield Meeting(obstacle, rows, pairs.nodes[rows])
+            is_concave = isinstance(obstacle, Ball) and obstacle.inside
+            yield Meeting(obstacle, rows, pairs.nodes[rows], is_concave)
 
 
 def deformation(system: System, displacement: Array) -> Array:
@@ -92,12 +94,23 @@ def gap_and_rows(system: System, displacement: Array) -> tuple[Array, Array]:
         return gap, rows
     for meeting in system.frames.meetings:
         places = system.points[meeting.nodes] + system.normals.touched(displacement)[meeting.pairs]
-        distance, slope = jax.vmap(jax.value_and_grad(meeting.obstacle.signed_distance))(places)
-        normals = -slope / jnp.linalg.norm(slope, axis=1, keepdims=True)
+        distance, normals = meeting.measure(places)
         more = (system.gap - system.frames.gap)[meeting.pairs]
         gap = gap.at[meeting.pairs].set(distance + more)
         rows = rows.at[meeting.pairs].set(normals)
     return gap, rows
+
+
+def rows_of_step(system: System, old: Array, new: Array) -> Array:
+    """Return the rows of N, (C, d), with which a step from y to y' (n,) was solved."""
+    rows = gap_and_rows(system, old)[1]
+    if system.frames is None or not system.frames.is_concave:
+        return rows
+    later = gap_and_rows(system, new)[1]
+    for meeting in system.frames.meetings:
+        if meeting.is_concave:
+            rows = rows.at[meeting.pairs].set(later[meeting.pairs])
+    return rows
 
 
 def placed(system: System, displacement: Array) -> System:
