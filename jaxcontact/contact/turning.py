@@ -12,7 +12,7 @@ from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, S
 from jaxcontact.contact.sweep_adjoint import solve_by_sweeps
 from jaxcontact.contact.sweeps import Equation, Fixed, contact_at, turned_form
 from jaxcontact.contact.vi import Bound, ContactProblem
-from jaxcontact.system.frames import Frames, FrameState, next_frames, turn, turned_places
+from jaxcontact.system.frames import Frames, FrameState, frame_start, next_frames, turn
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
 
@@ -94,15 +94,9 @@ class TurningProblem:
         unknowns, solution = solve_by_sweeps(equation, jax.lax.stop_gradient(fixed))
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(rhs.dtype)
         w = unknowns.velocity * poison
-        places = turned_places(self.frames, self.state)
-        step, increment = turn(
-            self.frames,
-            self.state.rotation,
-            places,
-            self.dt,
-            w.reshape(places.shape),
-            unknowns.increment,
-        )
+        start = frame_start(self.frames, self.state)
+        nodal = w.reshape(start.places.shape)
+        step, increment = turn(self.frames, start, self.dt, nodal, unknowns.increment)
         weights, value = contact_at(equation, fixed, w)
         multiplier = solution.multiplier if push is None else solution.multiplier + push
         return w, solution._replace(

@@ -54,14 +54,15 @@ def frames_of(scene: Scene, system: System, pairs: ContactPairs) -> Frames | Non
     is_whole = len(turning) == 1 and free.size == np.count_nonzero(members)
     contact_nodes = np.unique(pairs.nodes)
     positions = np.asarray(system.node_numbers)[contact_nodes].astype(np.int32)
+    places = np.searchsorted(contact_nodes, pairs.nodes)
     return Frames(
         reference=reference,
         origin=origin,
         moments=moments,
         members=None if is_whole else members,
         numbers=None if is_whole else numbers[free].astype(np.int32),
-        places=np.searchsorted(contact_nodes, pairs.nodes).astype(np.int32),
-        unknowns=(positions[:, None] * d + np.arange(d, dtype=np.int32)).reshape(-1),
+        places=None if np.array_equal(contact_nodes, pairs.nodes) else places.astype(np.int32),
+        unknowns=(positions * d + np.arange(d, dtype=np.int32)[:, None]).reshape(-1),
         gap=system.gap,
         meetings=tuple(_meetings(scene, pairs, numbers[pairs.nodes] < turning.size)),
     )
