@@ -6,213 +6,36 @@ is Müller and Schiela (2017) and MATH.md lies in the folder notebooks/ of the r
 """
 
 import importlib
-from types import ModuleType
-from typing import TYPE_CHECKING
-
-from jaxcontact import reference
-from jaxcontact.accuracy.estimate import ErrorEstimate, estimate_error
-from jaxcontact.accuracy.recommend import Recommendation, recommend
-from jaxcontact.accuracy.reduction_error import ReductionError, reduction_error
-from jaxcontact.contact import (
-    AlongDirection,
-    ClosedBranch,
-    CriticalCone,
-    OpenBranch,
-    ProjectedGaussSeidel,
-    RelaxedContact,
-    SemismoothNewton,
-    SmoothedContact,
-    Status,
-)
-from jaxcontact.control import scenes
-from jaxcontact.control.cost import TrackingCost, contact_force, contact_force_error, contact_time
-from jaxcontact.control.inner_product import control_dot, l2_value_and_grad
-from jaxcontact.derivative import (
-    DerivativeReport,
-    GradientCheck,
-    PhaseMean,
-    Verdict,
-    check_gradient,
-    derivative_report,
-    directional_derivative,
-    phase_mean,
-)
-from jaxcontact.linear import ConjugateGradient, Dense, NestedDissection
-from jaxcontact.motion.checks import SolveError
-from jaxcontact.motion.energy import Energy, energy
-from jaxcontact.motion.linearization import linearization_error, turned_gap
-from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
-from jaxcontact.motion.momentum import Momentum, momentum
-from jaxcontact.motion.pressure import contact_pressure
-from jaxcontact.motion.schedule import Schedule, sample
-from jaxcontact.motion.simulate import simulate
-from jaxcontact.motion.static import StaticContact, solve_static
-from jaxcontact.motion.step import step
-from jaxcontact.motion.stepper import Stepper, prepare, with_contact
-from jaxcontact.motion.stress import Stress, stress
-from jaxcontact.motion.trajectory import State, Trajectory
-from jaxcontact.optimize import (
-    LBFGS,
-    Actuator,
-    Descent,
-    Ending,
-    ExactFinish,
-    History,
-    Homotopy,
-    NewtonCG,
-    Optax,
-    Result,
-    Stationarity,
-    SteepestDescent,
-    WeakWolfe,
-    actuator,
-    boundary_actuator,
-    descend,
-    load_result,
-    optimize,
-    stationarity,
-)
-from jaxcontact.scene import meshes
-from jaxcontact.scene.compound import Along, Union
-from jaxcontact.scene.facets import Facets
-from jaxcontact.scene.io import read_mesh
-from jaxcontact.scene.join import join
-from jaxcontact.scene.material import KelvinVoigt
-from jaxcontact.scene.mesh import Mesh
-from jaxcontact.scene.obstacle import Ball, HalfSpace, SignedDistance
-from jaxcontact.scene.quality import MeshQuality
-from jaxcontact.scene.scene import Scene
-from jaxcontact.schemes import (
-    BackwardEuler,
-    ContactImplicit,
-    ContactStabilized,
-    RedistributedMass,
-    Trapezoidal,
-)
-from jaxcontact.system.discretize import discretize
-from jaxcontact.system.files import load_system
-from jaxcontact.system.reduction import reduce
-from jaxcontact.system.system import System
-from jaxcontact.transforms.time_loop import Checkpoint
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcontact.output import export, plot
+    from jaxcontact.api import *  # noqa: F403
+    from jaxcontact.output import export as export
+    from jaxcontact.output import plot as plot
 
-__all__ = [
-    "LBFGS",
-    "Actuator",
-    "Along",
-    "AlongDirection",
-    "BackwardEuler",
-    "Ball",
-    "Checkpoint",
-    "ClosedBranch",
-    "ConjugateGradient",
-    "ContactImplicit",
-    "ContactStabilized",
-    "CriticalCone",
-    "Dense",
-    "DerivativeReport",
-    "Descent",
-    "Ending",
-    "Energy",
-    "ErrorEstimate",
-    "ExactFinish",
-    "Facets",
-    "GradientCheck",
-    "HalfSpace",
-    "History",
-    "Homotopy",
-    "Inactive",
-    "KelvinVoigt",
-    "MemoryEstimate",
-    "Mesh",
-    "MeshQuality",
-    "Momentum",
-    "NestedDissection",
-    "NewtonCG",
-    "OpenBranch",
-    "Optax",
-    "PhaseMean",
-    "ProjectedGaussSeidel",
-    "Recommendation",
-    "RedistributedMass",
-    "ReductionError",
-    "RelaxedContact",
-    "Result",
-    "Scene",
-    "Schedule",
-    "SemismoothNewton",
-    "SignedDistance",
-    "SmoothedContact",
-    "SolveError",
-    "State",
-    "StaticContact",
-    "Stationarity",
-    "Status",
-    "SteepestDescent",
-    "Stepper",
-    "Stress",
-    "Strong",
-    "System",
-    "TrackingCost",
-    "Trajectory",
-    "Trapezoidal",
-    "Union",
-    "Verdict",
-    "WeakWolfe",
-    "actuator",
-    "boundary_actuator",
-    "check_gradient",
-    "contact_force",
-    "contact_force_error",
-    "contact_pressure",
-    "contact_time",
-    "control_dot",
-    "derivative_report",
-    "descend",
-    "directional_derivative",
-    "discretize",
-    "energy",
-    "estimate_error",
-    "estimate_memory",
-    "export",
-    "join",
-    "l2_value_and_grad",
-    "linearization_error",
-    "load_result",
-    "load_system",
-    "meshes",
-    "momentum",
-    "optimize",
-    "phase_mean",
-    "plot",
-    "prepare",
-    "read_mesh",
-    "recommend",
-    "reduce",
-    "reduction_error",
-    "reference",
-    "sample",
-    "scenes",
-    "simulate",
-    "solve_static",
-    "stationarity",
-    "step",
-    "stress",
-    "turned_gap",
-    "with_contact",
-]
-
-#: The first names of the two branches of the derivative.
-Strong, Inactive = ClosedBranch, OpenBranch
+__version__ = "0.1.0"
 
 #: Loaded when they are asked for: a simulation needs no pictures and no files.
 _LAZY = {"plot": "jaxcontact.output.plot", "export": "jaxcontact.output.export"}
 
 
-def __getattr__(name: str) -> ModuleType:
-    """Load `jc.plot` and `jc.export` on first use."""
+def __getattr__(name: str) -> Any:
+    """Load the public names with the first of them, `plot` and `export` each with its own.
+
+    So the command line shows its help without JAX.
+    """
     if name in _LAZY:
         return importlib.import_module(_LAZY[name])
+    if name == "__all__":
+        return [*importlib.import_module("jaxcontact.api").__all__, *_LAZY]
+    if not name.startswith("__"):
+        api = importlib.import_module("jaxcontact.api")
+        globals().update({public: getattr(api, public) for public in api.__all__})
+        if name in globals():
+            return globals()[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*__getattr__("__all__"), "__version__"])

@@ -72,6 +72,20 @@ class L2:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Euclidean:
+    """The inner product sum p q of parameters that are no control; all should be of one size."""
+
+    def dot(self, first: Array, second: Array) -> Array:
+        """Return the inner product of two elements, a scalar."""
+        return jnp.vdot(first, second)
+
+    def riesz(self, derivative: Array) -> Array:
+        """Return the derivative itself, which represents it."""
+        return derivative
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Weighted:
     """A diagonal inner product (p, q) = sum w p q."""
 

@@ -133,9 +133,7 @@ class Problem:
                     "optimise the control (T, N, d), or hand over an inner_product"
                 )
             product = _product_of(system, dt, controls, is_bounded=bounds is not None)
-        check_option(
-            "inner_product", product, InnerProduct, "control.inner_product.Weighted(weights)"
-        )
+        check_option("inner_product", product, InnerProduct, "Euclidean()")
         return cls(
             objective=as_partial(objective),
             product=product,
@@ -216,7 +214,8 @@ def _product_of(
     """Return the inner product that follows from the scene and the control map."""
     if system is None or dt is None:
         raise ValueError(
-            "an optimisation needs system= and dt=, or an inner_product=, to measure steps in"
+            "an optimisation needs system= and dt= to measure steps of a control in, or "
+            "inner_product=jc.Euclidean() for parameters that are no control"
         )
     if controls is None:
         return lumped_l2(system, dt) if is_bounded else L2(system, dt)

@@ -24,6 +24,7 @@ from jax import Array
 from jaxcontact.contact import ClosedBranch, SemismoothNewton, Status, WeakContact
 from jaxcontact.derivative.phase import moved, phase_spread, phase_words
 from jaxcontact.derivative.weak import contact_sizes, margins, sensitivity
+from jaxcontact.motion.chatter import ADVICE, chatter
 from jaxcontact.motion.checks import raise_if_failed
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper, StepPerturbation, with_contact, with_perturbation
@@ -86,6 +87,10 @@ class DerivativeReport:
     """Distance of the motion from that with exact contact, relative, in the l2 norm over nodes and
     time; zero if contact is exact."""
 
+    chatter: float
+    """Largest change of a contact force that alternates from step to step, relative to the largest
+    force; zero if none does. See `ChatterWarning`."""
+
     @property
     def is_differentiable(self) -> bool:
         """Whether the motion has a derivative, not only one-sided ones."""
@@ -115,6 +120,8 @@ class DerivativeReport:
             lines.append(f"  step {step}, node {node}{where}: {signs}")
         if self.distance:
             lines.append(f"smooth contact: {self.distance:.1e} from the motion of exact contact")
+        if self.chatter:
+            lines.append(ADVICE.format(size=self.chatter) + "; a gradient of forces follows it")
         if self.closing_speed:
             lines += phase_words(self.closing_speed, self.phase_spread)
         if self.duality_gap > MODES_DIFFER:
@@ -207,6 +214,7 @@ def derivative_report(
         closing_speed=speed,
         phase_spread=spread,
         distance=_distance_from_exact(stepper, trajectory, control, initial),
+        chatter=chatter(trajectory),
     )
 
 

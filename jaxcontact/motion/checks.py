@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -44,13 +45,15 @@ def check_steps(
     if control is None and steps is None and scheduled is None:
         raise ValueError("give a control (T, N, d) or (T, n), a schedule, or the number of steps")
     if control is not None:
-        check_control(stepper.system, control)
+        check_control(control, stepper.system.points.shape, stepper.system.size)
         _check_finite("control", control)
         if steps is not None and steps != np.shape(control)[0]:
             raise ValueError(
                 f"steps={steps} does not fit a control of {np.shape(control)[0]} steps; leave "
                 "steps out or cut the control"
             )
+    if not isinstance(steps, Integral | None) or isinstance(steps, bool):
+        raise ValueError(f"steps must be a whole number, got {steps!r}")
     n_steps = np.shape(control)[0] if control is not None else scheduled if steps is None else steps
     if scheduled is not None and n_steps != scheduled:
         raise ValueError(
@@ -62,14 +65,15 @@ def check_steps(
     return n_steps
 
 
-def check_control(system: System, control: Array) -> None:
-    """Check that a control has the shape (T, N, d) or, in unknowns, (T, n)."""
-    nodal = (system.n_nodes, system.dimension)
-    if np.shape(control)[1:] not in (nodal, (system.size,)):
+def check_control(
+    control: Array, nodal: tuple[int, ...], size: int, steps: int | None = None
+) -> None:
+    """Check the shape of a control: (T, N, d) with (N, d) = nodal, or (T, n) with n = size."""
+    shape, T = np.shape(control), "T" if steps is None else steps
+    if shape[1:] not in (nodal, (size,)) or steps not in (None, shape[0]):
         raise ValueError(
-            f"control must have shape (T, N, d) = (T, {nodal[0]}, {nodal[1]}), on all nodes, the "
-            f"clamped ones included, or in unknowns (T, n) = (T, {system.size}), got "
-            f"{np.shape(control)}"
+            f"control must have shape (T, N, d) = ({T}, {nodal[0]}, {nodal[1]}), on all nodes, the "
+            f"clamped ones included, or in unknowns (T, n) = ({T}, {size}), got {shape}"
         )
 
 
@@ -80,6 +84,11 @@ def check_initial(stepper: Stepper, initial: State | None) -> State:
     """
     system = stepper.system
     shape = (system.n_nodes, system.dimension)
+    if not isinstance(initial, State | None):
+        raise ValueError(
+            f"initial must be a State, got a {type(initial).__name__}; write "
+            "initial=jc.State(displacement, velocity)"
+        )
     if initial is None or initial.displacement is None or initial.velocity is None:
         rest = jnp.asarray(np.zeros(shape, system.dtype))
         initial = (State() if initial is None else initial).filled(rest)

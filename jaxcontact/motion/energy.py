@@ -85,13 +85,13 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     """
     check_every_step(trajectory)
     unknowns, system = trajectory.unknowns, stepper.system
-    if unknowns.shape[1:] != (system.size,):
+    if unknowns.shape[1:] != (system.size,) or trajectory.mark != system.mark:
         raise ValueError(
-            f"the trajectory has unknowns {unknowns.shape}, the system of the stepper "
-            f"{system.size}; hand over the stepper that made it"
+            f"the trajectory has {unknowns.shape[1]} unknowns, the system of the stepper "
+            f"{system.size} of its own; hand over the stepper that made it"
         )
     if control is not None:
-        check_control(system, control)
+        check_control(control, system.points.shape, system.size, len(unknowns) - 1)
     records = (unknowns, trajectory.rates, trajectory.contact_impulse)
     return _ledger(stepper, *records, control, trajectory.schedule, trajectory.frames)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from dataclasses import dataclass
 
 import jax
 from jax import Array
@@ -11,6 +12,28 @@ from jax.interpreters.ad import JVPTracer
 from jax.tree_util import GetAttrKey
 
 from jaxcontact.system.lift import Lift
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StoredFields:
+    """Nodal fields as a file keeps them."""
+
+    unknowns: Array
+    """The unknowns, (..., n)."""
+
+    rates: Array
+    """Their velocity, (..., n)."""
+
+    lift: Lift | None
+    """What makes nodal fields of them; None if these are there."""
+
+    displacement: Array | None
+    """Nodal displacement, (..., N, d) [m]; None where it is made."""
+
+    velocity: Array | None
+    """Nodal velocity, (..., N, d) [m/s]; None where it is made."""
+
 
 NAMES: tuple[str, str] = ("displacement", "velocity")
 
@@ -70,6 +93,19 @@ class NodalFields:
         if not isinstance(field, Tracer):
             self._fields[name] = field
         return field
+
+    def stored(self) -> StoredFields:
+        """Return what a file keeps of them, no field made for it."""
+        fields = (self.displacement, self.velocity) if self._lift is None else (None, None)
+        return StoredFields(self.unknowns, self.rates, self._lift, *fields)
+
+    @classmethod
+    def from_stored(cls, stored: StoredFields) -> NodalFields:
+        """Return the fields of a file."""
+        if stored.lift is not None:
+            return cls(stored.lift, stored.unknowns, stored.rates)
+        fields = (stored.unknowns, stored.rates, stored.displacement, stored.velocity)
+        return cls.tree_unflatten(None, fields)  # type: ignore[arg-type]
 
     def tree_flatten_with_keys(self) -> tuple[list[tuple[Hashable, Array]], int | None]:
         """Return the leaves, and the space dimension where the unknowns are the fields too."""

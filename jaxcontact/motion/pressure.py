@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from jax import Array
 
+from jaxcontact.motion.chatter import warn_of_chatter
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 
@@ -20,11 +21,12 @@ def contact_pressure(stepper: Stepper, trajectory: Trajectory) -> Array:
     depends on the scheme: the mean over the step for `ContactImplicit`, `ContactStabilized` and
     `Trapezoidal` (there the mean of the forces at both ends), the value at the end of the step
     for `BackwardEuler` and `RedistributedMass`. With `ContactImplicit` the pressure chatters and
-    does not converge: average it over some steps, or take `ContactStabilized`.
-
+    does not converge: average it over some steps, or take `ContactStabilized`. Where it does, a
+    `ChatterWarning` says so.
 
     Args:
         stepper: the stepper that made the trajectory.
         trajectory: T steps with C contact pairs.
     """
+    warn_of_chatter(trajectory)
     return trajectory.contact_impulse / (stepper.dt * stepper.system.contact_area[None, :])

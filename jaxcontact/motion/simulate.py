@@ -28,6 +28,7 @@ from jaxcontact.motion.frame_motion import FrameMotion, check_frames, frame_moti
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.nodal_fields import NodalFields
+from jaxcontact.motion.progress import Progress
 from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.supports import Moves
@@ -38,7 +39,7 @@ from jaxcontact.schemes.interface import first_state
 from jaxcontact.schemes.turning import make_step
 from jaxcontact.system.control_space import control_loads
 from jaxcontact.system.placing import gap_and_rows
-from jaxcontact.transforms.options import check_option
+from jaxcontact.transforms.options import check_kind, check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
 from jaxcontact.transforms.time_loop import Checkpoint, scan_steps
@@ -55,6 +56,7 @@ def simulate(
     checkpoint: Checkpoint | None = None,
     weak_contact: WeakContact | AlongDirection | None = None,
     schedule: Schedule | None = None,
+    progress: Progress | None = None,
 ) -> Trajectory:
     """Simulate the motion of the body.
 
@@ -76,6 +78,7 @@ def simulate(
             `ClosedBranch()` (default, Algorithm 1), `OpenBranch()`, `AlongDirection(control)`, or
             `CriticalCone()`, the exact one-sided derivative, in forward mode.
         schedule: loads on facet sets, obstacles and supports that change in time.
+        progress: `Progress(every, report)` reports the number of steps while they are made.
 
     Returns:
         The trajectory of T steps.
@@ -95,6 +98,7 @@ def simulate(
     the stepper; forward mode, as by `jax.jvp`, if `weak_contact` names a treatment (the default is
     a `jax.custom_vjp`); at weak contact the derivative that it names.
     """
+    check_kind("simulate", stepper, Stepper, "stepper = jc.prepare(jc.discretize(scene), dt)")
     start, scheduled = stepper, None
     if schedule is not None:
         schedule, scheduled = check_schedule(stepper.system, schedule)
@@ -113,6 +117,8 @@ def simulate(
         kinds = (WeakContact, AlongDirection)
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
     check_frames(stepper.system, schedule, weak_contact)
+    if progress is not None:
+        check_option("progress", progress, Progress, "Progress(every=100)")
     initial = check_initial(start, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
@@ -120,14 +126,14 @@ def simulate(
         stepper = _open_along(stepper, control, initial, steps, weak_contact, schedule)
         weak_contact = ClosedBranch()
     with _forward_mode_advice():
-        motion, moves = _run(
-            stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule
-        )
+        parts = (stepper, control, initial, weak_contact, steps, save_every, checkpoint, schedule)
+        motion, moves = _run(*parts, progress)
     values = motion._asdict()
     nodal = NodalFields(stepper.system.lifting, values.pop("unknowns"), values.pop("rates"))
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule)
+    mark = stepper.system.mark
+    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule, mark=mark)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
         warn_of_rotation(stepper.system, motion.unknowns, save_every)
@@ -151,7 +157,7 @@ class _Motion(NamedTuple):
 
 
 @in_full_precision
-@partial(jax.jit, static_argnames=("weak_contact", "steps", "save_every", "checkpoint"))
+@partial(jax.jit, static_argnames=("weak_contact", "steps", "save_every", "checkpoint", "progress"))
 def _run(
     stepper: Stepper,
     control: Array | None,
@@ -161,6 +167,7 @@ def _run(
     save_every: int,
     checkpoint: Checkpoint | None,
     schedule: Schedule | None,
+    progress: Progress | None = None,
 ) -> tuple[_Motion, Moves | None]:
     system, dt, operators = stepper.system, stepper.dt, stepper.operators
     operators = operators.changed(lambda _, problem: replace(problem, weak_contact=weak_contact))
@@ -204,8 +211,9 @@ def _run(
         )
 
     inputs = (control, stepper.perturbation, None if drive is None else every_step(drive))
+    loop = (advance, inputs) if progress is None else progress.watch(advance, inputs, steps)
     states, (impulse, (iterations, status, residual), contact) = scan_steps(
-        advance, start, inputs, steps, save_every, checkpoint
+        loop[0], start, loop[1], steps, save_every, checkpoint
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])

@@ -28,12 +28,15 @@ from jaxcontact.linear import (
 )
 from jaxcontact.linear.turned import TurnedFactor, turned_factor
 from jaxcontact.schemes import ContactImplicit, Operators, Scheme
+from jaxcontact.system.courant import courant_number
 from jaxcontact.system.frames import Frames
 from jaxcontact.system.rollers import hold_matrix
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
-from jaxcontact.transforms.options import check_option
+from jaxcontact.transforms.options import check_kind, check_option
 from jaxcontact.transforms.precision import in_full_precision
+from jaxcontact.transforms.show import shown_by
+from jaxcontact.transforms.traced import is_traced
 from jaxcontact.transforms.trees import exchange
 
 Tree = TypeVar("Tree")
@@ -112,13 +115,19 @@ class Stepper:
         """The contact problem whose solution is the contact at the end of a step."""
         return self.operators.problem
 
-    def __repr__(self) -> str:
-        """Return the choices that were made, without arrays."""
-        return (
-            f"Stepper(n={self.system.size}, contact_pairs={self.system.normals.count}, "
-            f"scheme={self.scheme}, linear_solver={self.linear_solver}, "
-            f"contact_solver={self.contact_solver})"
-        )
+    def _facts(self) -> dict[str, object]:
+        is_plain = self.system.basis is None and not is_traced((self.system, self.dt))
+        return {
+            "unknowns": self.system.size,
+            "contact_pairs": self.system.normals.count,
+            "dt": "" if is_traced(self.dt) else f"{np.asarray(self.dt):.4g} s",
+            "courant": float(courant_number(self.system, self.dt)) if is_plain else None,
+            "scheme": self.scheme,
+            "linear_solver": self.linear_solver,
+            "contact_solver": self.contact_solver,
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
 
 @in_full_precision
@@ -150,11 +159,11 @@ def prepare(
             not fit each other, the patterns are traced, a factor would not fit in memory, or a
             matrix is not positive definite.
     """
+    check_kind("prepare", system, System, "system = jc.discretize(scene)")
     scheme = ContactImplicit() if scheme is None else scheme
     check_option("scheme", scheme, Scheme, "ContactImplicit()")
-    is_number = not isinstance(dt, bool) and np.shape(dt) == ()
-    if not isinstance(dt, Tracer) and not (is_number and np.isfinite(dt) and np.asarray(dt) > 0.0):
-        raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+    if not is_traced(dt) and not _is_positive(dt):
+        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
     linear_solver, contact_solver = choose_solvers(system, linear_solver, contact_solver)
     dt = jnp.asarray(dt, system.dtype)
     mass, matrices, spans = scheme.matrices(system, dt)
@@ -165,6 +174,12 @@ def prepare(
         )
     problems = tuple(factorize(system, x, linear_solver, contact_solver) for x in matrices)
     return Stepper(system, dt, Operators(mass, problems, spans), scheme, linear_solver)
+
+
+def _is_positive(dt: object) -> bool:
+    """Return whether a concrete value is one positive number."""
+    number = np.asarray(dt)
+    return number.shape == () and number.dtype.kind in "iuf" and bool(0.0 < number < np.inf)
 
 
 def choose_solvers(

@@ -6,7 +6,8 @@ A motion is recorded in its unknowns, and nodal fields are lifted from them when
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,15 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxcontact.contact import Status
 from jaxcontact.motion.frame_motion import FrameMotion
 from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.scene.scene import Scene, clamped_nodes
+from jaxcontact.system.system import System
+from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.show import shown_by
+from jaxcontact.transforms.traced import is_traced
 
 
 @jax.tree_util.register_dataclass
@@ -57,6 +63,15 @@ class State:
             _nodal_field(scene, "displacement", displacement),
             _nodal_field(scene, "velocity", velocity),
         )
+
+    @classmethod
+    def at_rest(cls, system: System) -> State:
+        """Return the state of zeros, its arrays (N, d) in the type of the system.
+
+        For loops whose state needs its arrays, as a `jax.lax.scan` over `step` does.
+        """
+        zeros = jnp.asarray(np.zeros((system.n_nodes, system.dimension), system.dtype))
+        return cls(zeros, zeros)
 
     def filled(self, rest: Array) -> State:
         """Return the state with an array of zeros (N, d) in the place of None."""
@@ -160,6 +175,9 @@ class Trajectory:
     frames: FrameMotion | None = None
     """The frames of the bodies that turn; None without them (see `Scene.large_rotation`)."""
 
+    mark: str = field(default="", metadata={"static": True})
+    """What the unknowns stand for, `System.mark`."""
+
     @property
     def rotation(self) -> Array:
         """Rotation of each body with a frame, (T+1, F, d, d).
@@ -183,6 +201,26 @@ class Trajectory:
         if self.frames is None:
             raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
         return self.frames
+
+    def _facts(self) -> dict[str, object]:
+        if is_traced(self):
+            return {"steps": self.contact_impulse.shape[-2], "values": "traced"}
+        status, counts = np.unique(np.asarray(self.status), return_counts=True)
+        total = np.asarray(self.contact_force).sum(axis=-1)
+        return {
+            "steps": total.shape[-1],
+            "batch": "x".join(map(str, total.shape[:-1])),
+            "end": f"{np.max(np.asarray(self.time)):.4g} s",
+            "unknowns": self.unknowns.shape[-1],
+            "contact_pairs": self.gap.shape[-1],
+            "status": {
+                Status(int(kind)).name.lower(): int(count)
+                for kind, count in zip(status, counts, strict=True)
+            },
+            "largest_force": f"{np.max(total, initial=0.0):.4g} N",
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
     @property
     def unknowns(self) -> Array:
@@ -253,6 +291,19 @@ class Trajectory:
         is_before = sum(later[..., k : k + touches.shape[-1]] for k in range(4)) > 0
         speed = -jnp.diff(jnp.swapaxes(self.gap, -2, -1))[..., :-1] / self.dt[..., None, None]
         return jnp.max(jnp.where(is_before, speed, 0.0), axis=(-2, -1), initial=0.0)
+
+    def save(self, path: str | Path) -> None:
+        """Write the trajectory to an .npz file, which `load_trajectory` reads.
+
+        If the writing fails or is killed, a file that was there before is still there.
+
+        Raises:
+            ValueError: if the trajectory is traced.
+            OSError: if the file cannot be written.
+        """
+        if is_traced(self):
+            raise ValueError("a traced Trajectory has no values to save; save it outside")
+        save_dataclass(path, replace(self, nodal=self.nodal.stored()))
 
     @property
     def final(self) -> State:

@@ -1,4 +1,12 @@
-"""Optimisation in the inner product of the controls: methods, bounds, parametrised controls."""
+"""Optimisation in the inner product of the controls: methods, bounds, parametrised controls.
+
+The module is `jaxcontact.optimize`, and so is the function: to call the module is to call its
+function `optimize`.
+"""
+
+import inspect
+import sys
+from types import ModuleType
 
 from jaxcontact.control.actuators import Actuator, actuator, boundary_actuator
 from jaxcontact.optimize.certificate import Stationarity
@@ -36,3 +44,13 @@ __all__ = [
     "optimize",
     "stationarity",
 ]
+
+
+class _CallableModule(ModuleType):
+    """A module with the name of its function, which may be called under this name."""
+
+    __call__ = staticmethod(optimize)
+
+
+sys.modules[__name__].__class__ = _CallableModule
+__signature__ = inspect.signature(optimize)

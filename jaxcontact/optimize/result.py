@@ -15,6 +15,7 @@ from jax import Array
 from jaxcontact.optimize.certificate import Stationarity
 from jaxcontact.optimize.method import Ending, MethodState, S
 from jaxcontact.transforms.files import atomic_write, check_is_file
+from jaxcontact.transforms.show import shown_by
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,20 @@ class Result:
     state: MethodState | Sequence[np.ndarray] | None = field(default=None, repr=False)
     """Everything the method needs to go on as if it had not been interrupted; from a file the
     leaves alone."""
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "value": self.value,
+            "start": float(self.history.value[0]),
+            "iterations": len(self.history.value) - 1,
+            "gradients": int(self.history.evaluations[-1]),
+            "method": self.method,
+            "status": self.status.name,
+            "advice": self.status.partition(": ")[2],
+            "stationarity": self.stationarity or self.uncertified,
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
     def save(self, path: str | Path) -> None:
         """Write the result to an .npz file, from which `load_result` and `optimize` go on.

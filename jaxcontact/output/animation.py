@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.output.axes import import_matplotlib
+from jaxcontact.output.axes import import_matplotlib, moment_of
 from jaxcontact.output.body import frame, places, plot_body, scalars_of
 from jaxcontact.scene.scene import Scene
 
@@ -70,7 +70,7 @@ def animate(
         colors = float(np.min(sizes)), float(np.max(sizes))
     pyplot = import_matplotlib("pyplot")
     projection = "3d" if scene.mesh.dimension == 3 else None
-    figure = pyplot.figure(figsize=(5.0, 4.0), dpi=100, layout="constrained")
+    figure = pyplot.figure(figsize=(5.0, 4.0), dpi=80, layout="constrained")
     axes = figure.add_subplot(projection=projection)
     time = np.asarray(trajectory.time)
 
@@ -81,7 +81,7 @@ def animate(
             scene, motion[states[number]], field, scale=scale, limits=limits, colors=colors,
             label=label if len(figure.axes) == 1 else None, ax=axes,
         )  # fmt: skip
-        axes.set_title(f"t = {time[states[number]]:.3g} s")
+        axes.set_title(moment_of(float(time[states[number]]), time))
         return ()
 
     animation = import_matplotlib("animation").FuncAnimation(

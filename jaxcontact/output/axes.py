@@ -39,14 +39,31 @@ def make_axes(ax: Axes | None) -> Axes:
     return import_matplotlib("pyplot").subplots(layout="constrained")[1]
 
 
-def scale_axis(axis: Any, quantity: str, unit: str, values: ArrayLike) -> None:
-    """Name an axis whose data are in SI units and put the fitting prefix on its ticks."""
+def _prefix(values: ArrayLike) -> tuple[float, str]:
+    """Return the factor and the prefix that fit values in SI units."""
     largest = float(np.max(np.abs(np.asarray(values)), initial=0.0))
     exponent = 0 if largest == 0.0 else 3 * int(np.floor(np.log10(largest) / 3))
     exponent = min(max(exponent, min(_PREFIXES)), max(_PREFIXES))
-    factor = 10.0**exponent
+    return 10.0**exponent, _PREFIXES[exponent]
+
+
+def moment_of(time: float, times: ArrayLike) -> str:
+    """Return a time [s] in words, with the prefix that an axis of all times has."""
+    factor, prefix = _prefix(times)
+    return f"t = {time / factor:.4g} {prefix}s"
+
+
+def scale_axis(axis: Any, quantity: str, unit: str, values: ArrayLike) -> None:
+    """Name an axis whose data are in SI units and put the fitting prefix on its ticks."""
+    factor, prefix = _prefix(values)
     axis.set_major_formatter(lambda x, _: f"{x / factor:.6g}")
-    axis.set_label_text(f"{quantity} [{_PREFIXES[exponent]}{unit}]")
+    axis.set_label_text(f"{quantity} [{prefix}{unit}]")
+
+
+def scale_bar(ax: Axes, image: Any, quantity: str, unit: str, values: ArrayLike) -> None:
+    """Put a colour bar beside a picture, with a prefix as `scale_axis` chooses it."""
+    bar = ax.figure.colorbar(image, ax=ax)
+    scale_axis(bar.ax.yaxis, quantity, unit, values)
 
 
 def label_plane(ax: Axes) -> Axes:
@@ -55,6 +72,15 @@ def label_plane(ax: Axes) -> Axes:
     ax.set_xlabel("horizontal position [m]")
     ax.set_ylabel("vertical position [m]")
     return ax
+
+
+def check_planar(dimension: int) -> None:
+    """Raise a ValueError if a picture in the plane is asked for something else."""
+    if dimension != 2:
+        raise ValueError(
+            f"this picture is for d = 2, got d = {dimension}; write the motion with "
+            "jaxcontact.output.export.write_time_series and open it in ParaView"
+        )
 
 
 def add_grid(ax: Axes) -> Axes:

@@ -7,27 +7,32 @@ reference configuration and, on the nodes,
     contact_impulse, contact_pressure  of the step that ends at this time; zero off the contact set
     gap                                NaN off the contact set
 
-Format: VTK XML with zlib compression, written by meshio; PVD as in the ParaView user's guide.
+`write_time_series` writes a motion that is there, `TimeSeries` one that is being made.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcontact.motion.checks import check_every_step
 from jaxcontact.motion.trajectory import Trajectory
+from jaxcontact.output.vtu import (
+    check_motion,
+    check_series,
+    nodal_fields,
+    read_list,
+    write_level,
+    write_list,
+)
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
-from jaxcontact.transforms.files import atomic_write, make_folder
+from jaxcontact.transforms.files import make_folder
 
-__all__ = ["write_time_series"]
-
-_CELL_TYPES = {1: "line", 2: "triangle", 3: "tetra"}
+__all__ = ["TimeSeries", "write_time_series"]
 
 
 def write_time_series(
@@ -42,8 +47,9 @@ def write_time_series(
     """Write a motion as a time series for ParaView.
 
     Holds afterwards: `path` lists the files `<stem>_<step>.vtu` in the folder `<stem>` beside it
-    with their times. Files of these names are replaced, each as a whole, no other file is touched.
-    The PVD file is the last: it never lists a file that is not there, whenever the writing ends.
+    with their times. Files of these names are replaced, each as a whole; those of an earlier series
+    of this name are removed, no other file is touched. The PVD file never lists a file that is not
+    there, whenever the writing ends.
 
     Args:
         path: the PVD file to write; its folder is made if there is none.
@@ -64,89 +70,73 @@ def write_time_series(
     """
     check_every_step(trajectory)
     path = Path(path)
-    if path.suffix != ".pvd":
-        raise ValueError(f"a time series needs a path that ends in .pvd, got {str(path)!r}")
+    check_series(path, mesh, system)
+    check_motion(mesh, trajectory, control)
     if every < 1:
         raise ValueError(f"every must be 1 or more, got {every}")
-    displacement = np.asarray(trajectory.displacement)
-    steps = displacement.shape[0] - 1
-    if displacement.shape[1:] != mesh.points.shape:
-        raise ValueError(
-            f"the displacement has nodes and components {displacement.shape[1:]}, the mesh "
-            f"{mesh.points.shape}; pass the mesh of the scene that was simulated"
-        )
-    if control is not None and np.shape(control) != (steps, *mesh.points.shape):
-        raise ValueError(
-            f"control must have shape {(steps, *mesh.points.shape)}, got {np.shape(control)}"
-        )
-    fields = _nodal_fields(system, trajectory, control)
+    fields = nodal_fields(system, trajectory, control)
     time = np.asarray(trajectory.time)
+    steps = len(time) - 1
     folder = path.with_suffix("")
     make_folder(folder)
-
-    files, entries = [], []
+    times = {}
     for level in [*range(0, steps, every), steps]:
-        file = folder / f"{path.stem}_{level:0{len(str(steps))}d}.vtu"
-        _write_level(file, mesh, fields, level)
-        files.append(file)
-        place = quoteattr(f"{folder.name}/{file.name}")
-        entries.append(f'    <DataSet timestep="{time[level]:.12g}" part="0" file={place}/>')
-    with atomic_write(path, "w") as pvd:
-        pvd.write(
-            '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-            + "\n".join(entries)
-            + "\n  </Collection>\n</VTKFile>\n"
-        )
-    return [path, *files]
+        name = f"{path.stem}_{level:0{len(str(steps))}d}.vtu"
+        write_level(folder / name, mesh, fields, level)
+        times[name] = time[level]
+    write_list(path, times)
+    return [path, *(folder / name for name in times)]
 
 
-def _nodal_fields(
-    system: System, trajectory: Trajectory, control: ArrayLike | None
-) -> dict[str, np.ndarray]:
-    """Return the fields at the T+1 time levels, (T+1, N, 3) or (T+1, N) each."""
-    impulse = _from_time_zero(np.asarray(trajectory.contact_impulse))
-    dt = _from_time_zero(np.diff(np.asarray(trajectory.time)))
-    # There is no step before time zero: any length gives the pressure zero.
-    dt[0] = 1.0
-    pressure = impulse / (dt[:, None] * np.asarray(system.contact_area)[None, :])
-    fields = {
-        "displacement": _three_components(np.asarray(trajectory.displacement)),
-        "velocity": _three_components(np.asarray(trajectory.velocity)),
-    }
-    if control is not None:
-        fields["control"] = _three_components(_from_time_zero(np.asarray(control)))
-    nodes, shape = np.asarray(system.contact_nodes), (len(impulse), system.n_nodes)
-    # A node may be in several contact sets: forces add up, the smallest gap counts.
-    gap = np.asarray(trajectory.gap)
-    fields |= {"contact_impulse": np.zeros(shape), "contact_pressure": np.zeros(shape)}
-    fields["gap"] = np.full(shape, np.nan)
-    for pair, node in enumerate(nodes):
-        fields["contact_impulse"][:, node] += impulse[:, pair]
-        fields["contact_pressure"][:, node] += pressure[:, pair]
-        fields["gap"][:, node] = np.fmin(fields["gap"][:, node], gap[:, pair])
-    return fields
+class TimeSeries:
+    """A time series for ParaView that grows with a simulation in parts."""
 
+    def __init__(self, path: str | os.PathLike[str], mesh: Mesh, system: System):
+        """Name the series; what there is of it is kept until a part replaces it.
 
-def _from_time_zero(steps: np.ndarray) -> np.ndarray:
-    """Put zeros for time zero before the values of T steps, (T,...) -> (T+1,...)."""
-    return np.concatenate([np.zeros_like(steps[:1]), steps])
+        Args:
+            path: the PVD file; its folder is made if there is none.
+            mesh: the mesh of the scene.
+            system: the discretised scene.
 
+        Raises:
+            ValueError: if the path does not end in .pvd, or the mesh is that of another system.
+            OSError: if the folder cannot be made.
+        """
+        self._path, self._mesh, self._system = Path(path), mesh, system
+        check_series(self._path, mesh, system)
+        make_folder(self._path.with_suffix(""))
 
-def _three_components(vectors: np.ndarray) -> np.ndarray:
-    """Fill up vectors (..., d) with zeros to three components, as VTK wants them."""
-    padding = [(0, 0)] * (vectors.ndim - 1) + [(0, 3 - vectors.shape[-1])]
-    return np.pad(vectors, padding)
+    def append(
+        self, trajectory: Trajectory, first_step: int, control: ArrayLike | None = None
+    ) -> None:
+        """Write the recorded states of a part of the motion, one file each.
 
+        The series holds afterwards what it held up to the start of the part, and the part: after a
+        kill the same part, or an earlier one, can be written again. Files are named by step.
 
-def _write_level(file: Path, mesh: Mesh, fields: dict[str, np.ndarray], level: int) -> None:
-    # Here and not above: its import takes longer than that of this package without JAX.
-    import meshio
+        Args:
+            trajectory: the part, T steps; `save_every` thins it out.
+            first_step: number of steps before the part, 0 for the first.
+            control: the control of the part, (T, N, d).
 
-    picture = meshio.Mesh(
-        _three_components(np.asarray(mesh.points)),
-        [(_CELL_TYPES[mesh.dimension], np.asarray(mesh.cells))],
-        point_data={name: series[level] for name, series in fields.items()},
-    )
-    with atomic_write(file, "wb") as vtu:
-        # The writer of meshio opens a name, never a file: it gets that of the unfinished file.
-        picture.write(vtu.name, file_format="vtu")
+        Raises:
+            ValueError: if shapes differ, first_step is negative, or the PVD file is none.
+            OSError: if a file cannot be written.
+        """
+        check_motion(self._mesh, trajectory, control)
+        if first_step < 0:
+            raise ValueError(f"first_step must not be negative, got {first_step}")
+        fields = nodal_fields(self._system, trajectory, control)
+        steps, levels = len(trajectory.contact_impulse), len(trajectory.unknowns)
+        numbers = first_step + np.arange(0, steps + 1, steps // (levels - 1))
+        names = [f"{self._path.stem}_{number:09d}.vtu" for number in numbers]
+        # The part before ends where this one starts, and knows the step that led there.
+        before = read_list(self._path) if first_step else {}
+        times = {name: time for name, time in before.items() if name <= names[0]}
+        dt = float(trajectory.dt)
+        for level, (name, number) in enumerate(zip(names, numbers, strict=True)):
+            if name not in times:
+                write_level(self._path.with_suffix("") / name, self._mesh, fields, level)
+                times[name] = float(number * dt)
+        write_list(self._path, times)

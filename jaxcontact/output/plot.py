@@ -18,8 +18,22 @@ from jaxcontact.control.inner_product import nodal_norms
 from jaxcontact.motion.energy import Energy
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.output.animation import animate
-from jaxcontact.output.axes import add_grid, import_matplotlib, label_plane, make_axes, scale_axis
+from jaxcontact.output.axes import (
+    add_grid,
+    check_planar,
+    import_matplotlib,
+    label_plane,
+    make_axes,
+    scale_axis,
+)
 from jaxcontact.output.body import plot_body
+from jaxcontact.output.contact_plots import (
+    plot_active_set,
+    plot_contact_force,
+    plot_force,
+    plot_gap,
+    plot_pressure,
+)
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
 
@@ -34,8 +48,11 @@ __all__ = [
     "plot_control",
     "plot_distance",
     "plot_energy",
+    "plot_force",
+    "plot_gap",
     "plot_history",
     "plot_mesh",
+    "plot_pressure",
     "plot_state_error",
 ]
 
@@ -105,23 +122,30 @@ def plot_control(
     return label_plane(ax)
 
 
-def plot_history(value: ArrayLike, *, label: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the values of an objective over the iterations, minus the least one, on a log scale.
+def plot_history(
+    value: ArrayLike,
+    *,
+    best: float | None = None,
+    label: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the values of an objective over the iterations, minus the best one, on a log scale.
 
     Args:
         value: objective at every iterate, (iterations+1,).
+        best: best known value; default the least of these.
         label: name in the legend.
         ax: axes to draw into; default those of a new figure.
 
     Returns:
-        The axes; the iterate with the least value has no point.
+        The axes; an iterate with the best value, or a better one, has no point.
     """
     value = np.asarray(value)
-    excess = value - np.min(value)
+    excess = value - (np.min(value) if best is None else best)
     ax = make_axes(ax)
     ax.semilogy(np.where(excess > 0.0, excess, np.nan), label=label)
     ax.set_xlabel("iteration")
-    ax.set_ylabel("value of the functional minus least value")
+    ax.set_ylabel(f"functional minus {'its least' if best is None else 'the best known'} value")
     return add_grid(ax)
 
 
@@ -172,69 +196,6 @@ def plot_state_error(
     return add_grid(ax)
 
 
-def plot_contact_force(
-    system: System,
-    trajectory: Trajectory,
-    step: int,
-    *,
-    label: str | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the contact force on each node in one step over its horizontal position.
-
-    Args:
-        system: the system of the motion, d = 2.
-        trajectory: the motion, T steps.
-        step: step 1, ..., T; the force is the impulse of the step over its length.
-        label: name in the legend.
-        ax: axes to draw into; default those of a new figure.
-
-    Returns:
-        The axes, positions in the reference configuration.
-
-    Raises:
-        ValueError: if the system is not planar or there is no such step.
-    """
-    _check_planar(system.dimension)
-    steps = len(trajectory.contact_impulse)
-    if not 1 <= step <= steps:
-        raise ValueError(f"step must be one of 1, ..., {steps}, got {step}")
-    position, order = _contact_positions(system)
-    force = np.asarray(trajectory.contact_force)
-    ax = make_axes(ax)
-    ax.plot(position, force[step - 1, order], marker="o", markersize=4, label=label)
-    scale_axis(ax.xaxis, "horizontal position", "m", 1.0)
-    scale_axis(ax.yaxis, "contact force", "N", force)
-    return add_grid(ax)
-
-
-def plot_active_set(system: System, trajectory: Trajectory, *, ax: Axes | None = None) -> Axes:
-    """Draw when and where the gap is closed, coloured by the contact force on each node.
-
-    Args:
-        system: the system of the motion; in 2D the nodes stand at their horizontal position,
-            otherwise in the order of `system.contact_nodes`.
-        trajectory: the motion, T steps.
-        ax: axes to draw into; default those of a new figure.
-
-    Returns:
-        The axes, with time to the right, white where the gap is open, and a colour bar.
-    """
-    if system.dimension == 2:
-        position, order = _contact_positions(system)
-    else:
-        position = order = np.arange(len(system.contact_nodes))
-    force = np.ma.masked_array(trajectory.contact_force, ~np.asarray(trajectory.active))
-    time = np.asarray(trajectory.dt) * np.arange(len(force) + 1)
-    ax = make_axes(ax)
-    image = ax.pcolormesh(time, _cell_edges(position), force[:, order].T, cmap="plasma_r")
-    bar = ax.figure.colorbar(image, ax=ax)
-    scale_axis(bar.ax.yaxis, "contact force on a node", "N", force.filled(0.0))
-    scale_axis(ax.xaxis, "time", "s", trajectory.time)
-    ax.set_ylabel("horizontal position [m]" if system.dimension == 2 else "contact node")
-    return ax
-
-
 def plot_energy(trajectory: Trajectory, ledger: Energy, *, ax: Axes | None = None) -> Axes:
     """Draw the energy ledger over time: the energies, and what went in and out until then.
 
@@ -266,31 +227,7 @@ def plot_energy(trajectory: Trajectory, ledger: Energy, *, ax: Axes | None = Non
     return add_grid(ax)
 
 
-def _check_planar(dimension: int) -> None:
-    if dimension != 2:
-        raise ValueError(
-            f"this picture is for d = 2, got d = {dimension}; write the motion with "
-            "jaxcontact.output.export.write_time_series and open it in ParaView"
-        )
-
-
 def _positions(mesh: Mesh, displacement: ArrayLike | None) -> np.ndarray:
-    _check_planar(mesh.dimension)
+    check_planar(mesh.dimension)
     x = np.asarray(mesh.points)
     return x if displacement is None else x + np.asarray(displacement)
-
-
-def _contact_positions(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sorted horizontal positions of the contact pairs and their order, (C,) each."""
-    horizontal = np.asarray(system.points)[system.contact_nodes, 0]
-    order = np.argsort(horizontal)
-    return horizontal[order], order
-
-
-def _cell_edges(position: np.ndarray) -> np.ndarray:
-    """Return the C+1 ends of cells around C sorted positions."""
-    if len(position) == 1:
-        return position[0] + np.array([-0.5, 0.5])
-    middle = 0.5 * (position[1:] + position[:-1])
-    first, last = 2 * position[0] - middle[0], 2 * position[-1] - middle[-1]
-    return np.concatenate([[first], middle, [last]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import os
 from pathlib import Path
@@ -113,7 +114,27 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
             that `Mesh.from_arrays` refuses.
     """
     path = Path(path)
-    source = _read(path)
+    source, model_dimension = read_source(path)
+    return mesh_of(source, path, dimension, model_dimension)
+
+
+def read_source(path: Path) -> tuple[meshio.Mesh, int]:
+    """Return what meshio reads from a file, and the dimension of its model, 0 if it tells none."""
+    return _read(path), _gmsh_dimension(path)
+
+
+def mesh_of(
+    source: meshio.Mesh, path: Path, dimension: int | None, model_dimension: int = 0
+) -> Mesh:
+    """Return the mesh in what meshio has read; see `read_mesh`.
+
+    Args:
+        source: cells, points and groups; not changed.
+        path: the file, or where they come from, for messages.
+        dimension: dimension of the cells to take; None is the highest.
+        model_dimension: dimension of the geometry that they are the mesh of; 0 is not known.
+    """
+    source = copy.copy(source)
     make_simplicial(path, source)
     d = dimension if dimension is not None else max((b.dim for b in source.cells), default=0)
     if d not in (1, 2, 3):
@@ -126,9 +147,9 @@ def read_mesh(path: str | os.PathLike[str], *, dimension: int | None = None) -> 
             f"{path}: cells of type {', '.join(others)} are not supported; split them into "
             f"{SIMPLICES[d]} cells or mesh again (Gmsh: -order 1 and no recombination)"
         )
-    if dimension is None and d < _gmsh_dimension(path):
+    if dimension is None and d < model_dimension:
         raise ValueError(
-            f"{path}: the model has dimension {_gmsh_dimension(path)}, but the file has only "
+            f"{path}: the model has dimension {model_dimension}, but the file has only "
             f"{_contents(source)}, since the body is in no physical group; put it into one, or "
             f"read the {SIMPLICES[d]} cells with dimension={d}"
         )

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -23,16 +25,11 @@ from jax import Array
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from jaxcontact.scene.cells import (
-    area_vectors,
-    boundary_facets,
-    cell_volumes,
-    components,
-    end_signs,
-    facet_keys,
-)
+from jaxcontact.scene.cells import boundary_facets, cell_volumes, components, facet_keys
+from jaxcontact.scene.choice import chosen_facets
 from jaxcontact.scene.mesh_checks import (
     as_indices,
+    as_motion,
     as_points,
     check_cells,
     check_geometry,
@@ -40,7 +37,11 @@ from jaxcontact.scene.mesh_checks import (
 )
 from jaxcontact.scene.quality import MeshQuality, mesh_quality
 from jaxcontact.scene.refine import edges_of, refine_cells, refine_facets, refine_points
-from jaxcontact.transforms.traced import Values, as_array, is_traced
+from jaxcontact.transforms.show import shown_by
+from jaxcontact.transforms.traced import Values, is_traced
+
+if TYPE_CHECKING:
+    import meshio
 
 __all__ = ["Mesh", "boundary_facets", "cell_volumes", "facet_keys"]
 
@@ -110,6 +111,25 @@ class Mesh:
         }
         return cls(x, corners, facet_sets, cell_sets, layout=_layout(x, None))
 
+    @staticmethod
+    def from_meshio(source: meshio.Mesh, *, dimension: int | None = None) -> Mesh:
+        """The mesh in an object of meshio, its groups included; see `read_mesh`."""
+        from jaxcontact.scene.io import mesh_of
+
+        return mesh_of(source, Path("the meshio mesh"), dimension)
+
+    @staticmethod
+    def from_gmsh(*, dimension: int | None = None) -> Mesh:
+        """The mesh of the current model of Gmsh, its physical groups as sets and regions.
+
+        Raises:
+            ImportError: The package gmsh is not installed.
+            ValueError: Gmsh is not initialised or holds no mesh, or as of `read_mesh`.
+        """
+        from jaxcontact.scene.gmsh_model import current_model
+
+        return current_model(dimension)
+
     def with_points(self, points: ArrayLike) -> Mesh:
         """The same topology at other node positions, for moving meshes and shape derivatives.
 
@@ -147,17 +167,7 @@ class Mesh:
 
         Derivative: by `points`, the rotation and the translation.
         """
-        d, motion = self.dimension, (rotation, translation)
-        turn, shift = (np.eye(d) if rotation is None else as_array(rotation)), np.zeros(d)
-        if translation is not None:
-            shift = as_array(translation)
-        if turn.shape != (d, d) or shift.shape != (d,):
-            raise ValueError(
-                f"a mesh of dimension {d} needs a rotation ({d}, {d}) and a translation ({d},), "
-                f"got {turn.shape} and {shift.shape}"
-            )
-        if not is_traced(turn) and not _is_rotation(np.asarray(turn)):
-            raise ValueError(f"rotation must be orthogonal with determinant 1, got {turn.tolist()}")
+        turn, shift = as_motion(rotation, translation, self.dimension)
 
         def move(x: Values) -> Values:
             # A product only where there is one: a translation leaves x @ 1 its digits.
@@ -166,7 +176,7 @@ class Mesh:
 
         mesh = (
             self
-            if self.layout is None or is_traced(motion)
+            if self.layout is None or is_traced((turn, shift))
             else dataclasses.replace(self, layout=move(self.layout))
         )
         return mesh.with_points(move(self.points))
@@ -219,23 +229,9 @@ class Mesh:
                 f"a new facet set needs a name, a string, beside those of {sorted(self.facets)}; "
                 f"got {name!r}"
             )
-        boundary = boundary_facets(self.cells)
         x = self.positions("the choice of facets")
-        vectors = area_vectors(x, boundary, end_signs(self.cells))
-        normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-        is_chosen = np.asarray(predicate(x[boundary].mean(axis=1), normals))
-        if is_chosen.dtype != bool or is_chosen.shape != (len(boundary),):
-            raise ValueError(
-                f"the predicate must return bool of shape ({len(boundary)},), one for each "
-                f"boundary facet; it returned {is_chosen.dtype} of shape {is_chosen.shape}"
-            )
-        if not is_chosen.any():
-            low, high = x[boundary].min(axis=(0, 1)), x[boundary].max(axis=(0, 1))
-            raise ValueError(
-                f"facet set {name!r}: the predicate chooses none of the {len(boundary)} boundary "
-                f"facets, whose nodes lie between {low.tolist()} and {high.tolist()}"
-            )
-        return dataclasses.replace(self, facets={**self.facets, name: boundary[is_chosen]})
+        chosen = chosen_facets(name, x, self.cells, predicate)
+        return dataclasses.replace(self, facets={**self.facets, name: chosen})
 
     def quality(self) -> MeshQuality:
         """The mean ratio and the smallest height of every cell; print it to see the worst cells.
@@ -287,13 +283,18 @@ class Mesh:
         """
         return components(self.cells, self.n_nodes)
 
+    def _facts(self) -> dict[str, object]:
+        return {
+            "dimension": self.dimension,
+            "nodes": self.n_nodes,
+            "cells": self.n_cells,
+            "facets": {name: len(facets) for name, facets in self.facets.items()},
+            "regions": {name: len(cells) for name, cells in self.regions.items()},
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
+
 
 def _layout(points: Values, last: np.ndarray | None) -> np.ndarray | None:
     """Concrete positions as NumPy; the last ones if these are traced."""
     return last if isinstance(points, Tracer) else np.asarray(points)
-
-
-def _is_rotation(matrix: np.ndarray) -> bool:
-    """Whether a matrix (d,d) is a rotation, up to rounding in float32."""
-    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5)
-    return is_orthogonal and np.linalg.det(matrix) > 0.0

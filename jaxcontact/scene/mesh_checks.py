@@ -11,7 +11,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from jaxcontact.scene.cells import cell_volumes, facet_keys
-from jaxcontact.transforms.traced import Values
+from jaxcontact.transforms.traced import Values, as_array, is_traced
 
 
 def match_boundary(name: str, facets: np.ndarray, boundary: np.ndarray) -> np.ndarray:
@@ -66,6 +66,27 @@ def as_indices(array: ArrayLike, what: str, columns: tuple[int, ...], size: int)
             f"{indices[outside[0]].tolist()}: count from 0 to the size of the mesh"
         )
     return indices.astype(np.int32)
+
+
+def as_motion(
+    rotation: ArrayLike | None, translation: ArrayLike | None, d: int
+) -> tuple[Values, Values]:
+    """A rotation (d,d) and a translation (d,) [m], checked; None is none."""
+    turn = np.eye(d) if rotation is None else as_array(rotation)
+    shift = np.zeros(d) if translation is None else as_array(translation)
+    if turn.shape != (d, d) or shift.shape != (d,):
+        raise ValueError(
+            f"a mesh of dimension {d} needs a rotation ({d}, {d}) and a translation ({d},), "
+            f"got {turn.shape} and {shift.shape}"
+        )
+    if is_traced(turn):
+        return turn, shift
+    matrix = np.asarray(turn)
+    # Up to rounding in float32.
+    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(d), atol=1e-5)
+    if not is_orthogonal or np.linalg.det(matrix) <= 0.0:
+        raise ValueError(f"rotation must be orthogonal with determinant 1, got {matrix.tolist()}")
+    return turn, shift
 
 
 def check_cells(cells: np.ndarray, n_nodes: int) -> None:

@@ -16,7 +16,10 @@ import numpy as np
 
 from jaxcontact.scene.mesh import Mesh, boundary_facets
 
-__all__ = ["box", "disc", "half_ball", "half_disc", "interval", "rectangle"]
+__all__ = ["ball", "box", "disc", "half_ball", "half_disc", "interval", "rectangle"]
+
+#: Signs that make the eight octants of the one where x, y >= 0 >= z, the lower ones first.
+_OCTANTS = np.array([(i, j, k) for k in (1, -1) for j in (1, -1) for i in (1, -1)])
 
 _SIDES = {
     1: (("left", "right"),),
@@ -75,26 +78,33 @@ def box(lengths: tuple[float, float, float], *, h: float) -> Mesh:
     return _kuhn_grid(_check_lengths(lengths, 3), h)
 
 
-def disc(radius: float, *, h: float) -> Mesh:
+def disc(radius: float, *, h: float, contact: tuple[float, float] = (-120.0, -60.0)) -> Mesh:
     """The disc around the origin, with facet sets `boundary` and `contact`.
-
-    `contact` is the arc between -120 and -60 degrees.
 
     Args:
         radius: Radius [m].
         h: Distance of the rings [m], rounded down so that ceil(radius / h) rings fit.
+        contact: Start and end of the arc `contact`, counter-clockwise [degrees]: the facets whose
+            middle lies between them. (-180, 180) is the whole boundary.
 
     Returns:
         A mesh of m = ceil(radius / h) rings with 6 k nodes on ring k and 6 m^2 triangles.
 
     Raises:
-        ValueError: A length is not positive and finite.
+        ValueError: A length is not positive and finite, or the arc holds no facet.
     """
     m = _count("radius", radius, h)
     points, cells, node = _rings(radius, m, sectors=6)
     edge = np.arange(6 * m)
     boundary = np.stack([node(m, edge), node(m, edge + 1)], axis=1)
-    return Mesh.from_arrays(points, cells, {"boundary": boundary, "contact": boundary[m : 2 * m]})
+    is_contact = ((edge + 0.5) * 60.0 / m - 180.0 - contact[0]) % 360.0 < contact[1] - contact[0]
+    if not is_contact.any():
+        raise ValueError(
+            f"no facet has its middle in the arc contact={contact}, counter-clockwise in degrees; "
+            f"a facet has {60.0 / m:.3g} of them"
+        )
+    sets = {"boundary": boundary, "contact": boundary[is_contact]}
+    return Mesh.from_arrays(points, cells, sets)
 
 
 def half_disc(radius: float, *, h: float) -> Mesh:
@@ -147,16 +157,44 @@ def half_ball(radius: float, *, h: float) -> Mesh:
     Raises:
         ValueError: A length is not positive and finite.
     """
+    points, cells, facets, low = _blown_up(radius, h, _OCTANTS[:4])
+    top = (points[facets, 2] == 0).all(axis=1)
+    return Mesh.from_arrays(points, cells, {"clamped": facets[top], "contact": facets[low & ~top]})
+
+
+def ball(radius: float, *, h: float) -> Mesh:
+    """The ball around the origin, with facet sets `boundary` and `contact`.
+
+    It is `half_ball` and its mirror image; `contact` is the same part of the sphere.
+
+    Args:
+        radius: Radius [m].
+        h: Distance of the shells [m], as of `half_ball`.
+
+    Returns:
+        A mesh of m = max(2, ceil(radius / h)) shells and 8 m^3 tetrahedra.
+
+    Raises:
+        ValueError: A length is not positive and finite.
+    """
+    points, cells, facets, low = _blown_up(radius, h, _OCTANTS)
+    return Mesh.from_arrays(points, cells, {"boundary": facets, "contact": facets[low]})
+
+
+def _blown_up(radius: float, h: float, octants: np.ndarray):
+    """Points (N,3), cells (E,4) and boundary facets (B,3) of octants of a ball.
+
+    With them whether the origin sees a facet within 30 degrees of the lowest point, (B,).
+    """
     m = max(2, _count("radius", radius, h))
-    lattice, cells = _half_octahedron(m)
+    lattice, cells = _octahedron(m, octants)
     shell = np.abs(lattice).sum(axis=1)
     length = np.maximum(np.linalg.norm(lattice, axis=1), 1.0)
     points = lattice * (radius * shell / (m * length))[:, None]
     facets = boundary_facets(cells)
-    top = (lattice[facets, 2] == 0).all(axis=1)
     centroids = points[facets].mean(axis=1)
     low = -centroids[:, 2] >= math.cos(math.pi / 6) * np.linalg.norm(centroids, axis=1)
-    return Mesh.from_arrays(points, cells, {"clamped": facets[top], "contact": facets[low & ~top]})
+    return points, cells, facets, low
 
 
 def _kuhn_grid(lengths: tuple[float, ...], h: float) -> Mesh:
@@ -220,8 +258,8 @@ def _rings(radius: float, m: int, sectors: int):
     return points, np.concatenate(cells), node
 
 
-def _half_octahedron(m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lattice points (N,3) and cells (E,4) of |i| + |j| + |k| <= m, k <= 0.
+def _octahedron(m: int, octants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lattice points (N,3) and cells (E,4) of |i| + |j| + |k| <= m in some octants.
 
     With a = (|i|+|j|+|k|, ., .) as partial sums an octant is m >= a_1 >= a_2 >= a_3 >= 0, on which
     Kuhn's simplices of the unit grid fit exactly; octants are mirror images, hence conforming.
@@ -233,11 +271,10 @@ def _half_octahedron(m: int) -> tuple[np.ndarray, np.ndarray]:
     octant = np.stack(
         [sums[..., 0] - sums[..., 1], sums[..., 2], sums[..., 2] - sums[..., 1]], axis=-1
     )
-    signs = np.array([(1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1)])
-    corners = octant * signs[:, None, None]  # (E/4,4,3) -> (4,E/4,4,3)
-    for mirrored in (corners[1], corners[2]):
-        mirrored[:, [2, 3]] = mirrored[:, [3, 2]]
-    shape = (2 * m + 1, 2 * m + 1, m + 1)
+    corners = octant * octants[:, None, None]  # (E/8,4,3) -> (octants,E/8,4,3)
+    is_mirrored = np.prod(octants, axis=1) < 0
+    corners[is_mirrored] = corners[is_mirrored][:, :, [0, 1, 3, 2]]
+    shape = (2 * m + 1, 2 * m + 1, m + 1 if (octants[:, 2] > 0).all() else 2 * m + 1)
     grid = np.stack([*np.indices(shape)], axis=-1).reshape(-1, 3) - m
     inside = np.abs(grid).sum(axis=1) <= m
     number = np.cumsum(inside) - 1

@@ -173,6 +173,21 @@ def _check_slope(obstacle: Obstacle, slope: np.ndarray) -> None:
         )
 
 
+def _advice(value: object) -> str:
+    """Return what to write instead of something that is no obstacle."""
+    if isinstance(value, str):
+        return (
+            f"a facet set of another body of the mesh is jc.Facets({value!r}), and a plane is "
+            "jc.HalfSpace(point, normal)"
+        )
+    if callable(value):
+        return "a function that returns the signed distance of a point is jc.SignedDistance(...)"
+    return (
+        "it needs a method signed_distance, as jc.HalfSpace has; contact with another body is "
+        "jc.Facets(name), given to a contact set by itself"
+    )
+
+
 def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
     """Check what is concrete in an obstacle and its parts.
 
@@ -183,10 +198,7 @@ def check_obstacle(obstacle: Obstacle, dimension: int) -> None:
     for part in getattr(obstacle, "parts", ()):
         check_obstacle(part, dimension)
     if not callable(getattr(obstacle, "signed_distance", None)):
-        raise ValueError(
-            f"{obstacle!r} is no obstacle: it needs a method signed_distance, as jc.HalfSpace has; "
-            "contact with another body is jc.Facets(name), given to a contact set by itself"
-        )
+        raise ValueError(f"{obstacle!r} is no obstacle: {_advice(obstacle)}")
     for name in ("point", "normal", "center", "direction"):
         field_value = getattr(obstacle, name, None)
         if field_value is None:

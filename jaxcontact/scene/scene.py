@@ -16,6 +16,7 @@ from jaxcontact.scene.facets import Facets, check_each_interface_once, check_fac
 from jaxcontact.scene.material import KelvinVoigt, check_material
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.obstacle import Obstacle, check_obstacle
+from jaxcontact.transforms.options import check_kind
 from jaxcontact.transforms.traced import as_array, is_traced
 
 
@@ -38,7 +39,9 @@ class Scene:
 
     contact: Mapping[str, Obstacle | tuple[Obstacle, ...] | Facets] = field(default_factory=dict)
     """Facet sets that may touch, with the obstacle that each may touch: a rigid one, a tuple of
-    rigid ones that each node may touch all, or `Facets` of another body."""
+    rigid ones that each node may touch all, or `Facets` of another body. Nodes that are clamped
+    too have no contact with rigid ones: their gap is checked in the scene, and no more where a
+    `Schedule` moves obstacle or clamped set."""
 
     traction: Mapping[str, Array | np.ndarray] = field(default_factory=dict)
     """Facet sets with a constant surface force, each (d,) [N/m^(d-1)]."""
@@ -61,27 +64,43 @@ def check_scene(scene: Scene) -> None:
     """Check everything in a scene that is concrete.
 
     Raises:
-        ValueError: if a name is not in the mesh, clamped and contact sets share nodes, two bodies
-            share nodes or constrain each other's facets, a vector has the wrong shape, is not
-            finite or, of a roller, zero, or a material value is out of range.
+        ValueError: if it is no scene, a name is not in the mesh, a contact set is clamped as a
+            whole or, before another body, in part, two bodies share nodes or constrain each other's
+            facets, a vector has the wrong shape, is not finite or, of a roller, zero, or a material
+            value is out of range.
     """
+    check_kind("discretize", scene, Scene, "scene = jc.Scene(mesh, material, ...)")
     mesh = scene.mesh
     if isinstance(scene.clamped, str):
         raise ValueError(f"clamped must be a tuple of names; write clamped=({scene.clamped!r},)")
+    if isinstance(scene.clamped, Mapping):
+        raise ValueError(
+            f"clamped must be a tuple of names, clamped={tuple(scene.clamped)}: these sets are "
+            "held at zero; how they move is said by jc.simulate(..., schedule=jc.Schedule(motion="
+            "{name: displacements (T+1, d)}))"
+        )
+    if not isinstance(scene.contact, Mapping):
+        raise ValueError(
+            "contact must be a mapping from facet sets to obstacles, such as contact={'bottom': "
+            f"jc.HalfSpace(point, normal)}}; got a {type(scene.contact).__name__}"
+        )
     for name in (*scene.clamped, *scene.rollers, *scene.contact, *scene.traction):
         if name not in mesh.facets:
             raise ValueError(f"facet set {name!r} is not in the mesh; it has {sorted(mesh.facets)}")
     clamped = clamped_nodes(scene)
     for name, obstacle in scene.contact.items():
-        shared = np.intersect1d(clamped, mesh.facets[name])
-        if shared.size:
-            raise ValueError(
-                f"contact set {name!r} and the clamped sets {sorted(scene.clamped)} share "
-                f"{shared.size} nodes, first {shared[:5].tolist()}; a clamped node cannot be in "
-                "contact: leave a row of facets between the two sets"
-            )
         if obstacle == ():
             raise ValueError(f"contact[{name!r}] is an empty tuple; give it an obstacle")
+        shared = np.intersect1d(clamped, mesh.facets[name])
+        if shared.size and isinstance(obstacle, Facets):
+            raise ValueError(
+                f"contact set {name!r} and the clamped sets {sorted(scene.clamped)} share "
+                f"{shared.size} nodes, first {shared[:5].tolist()}, and what may touch them moves: "
+                f"write contact={{{obstacle.name!r}: jc.Facets({name!r})}}, or leave a row of "
+                "facets between the two sets"
+            )
+        if shared.size == np.unique(mesh.facets[name]).size:
+            raise ValueError(f"every node of contact set {name!r} is clamped; clamp fewer nodes")
         if isinstance(obstacle, Facets):
             check_facets(name, obstacle, mesh)
             continue

@@ -26,8 +26,10 @@ from jaxcontact.system.mortar import directions, mortar_rows
 from jaxcontact.system.pairing import direction_of, find_meeting
 from jaxcontact.system.pairs import ContactPairs
 from jaxcontact.system.twins import drop_twins
-from jaxcontact.transforms.traced import as_array, is_traced
+from jaxcontact.transforms.traced import as_array, is_traced, poison_unless, take_rows
 
+#: A gap may be negative by so many of its rounding errors.
+PENETRATION = 64.0
 #: Owner and members of pairs, before they are known.
 _UNKNOWN = (np.zeros(0, np.int32), np.zeros((0, 0), bool))
 
@@ -77,10 +79,35 @@ def contact_pairs(
         owner=np.concatenate(owner),
         members=np.concatenate(members),
     )
+    pairs = _without_clamped(scene, pairs, clamped_set)
     # Where bodies turn, equal rows differ in another place.
     if is_traced((pairs.gap, pairs.normals)) or scene.large_rotation:
         return pairs
     return drop_twins(pairs, [facets for *_, facets in sets], points)
+
+
+def _without_clamped(scene: Scene, pairs: ContactPairs, clamped_set: np.ndarray) -> ContactPairs:
+    """Return the pairs of nodes that can move, after a look at the gap of the others.
+
+    If a gap that cannot be looked at is negative, all gaps are NaN.
+    """
+    is_held = clamped_set[pairs.nodes] >= 0
+    if not is_held.any():
+        return pairs
+    kept, held = np.flatnonzero(~is_held), np.flatnonzero(is_held)
+    depth = -take_rows(pairs.gap, held) - PENETRATION * take_rows(pairs.rounding, held)
+    moving = ContactPairs(*(take_rows(as_array(x), kept) for x in pairs))
+    if is_traced(depth):
+        return moving._replace(gap=poison_unless(jnp.all(depth <= 0.0), moving.gap))
+    worst = int(np.argmax(depth))
+    if depth[worst] > 0.0:
+        node, number = int(pairs.nodes[held[worst]]), int(np.argmax(pairs.members[held[worst]]))
+        raise ValueError(
+            f"{np.count_nonzero(np.asarray(depth) > 0.0)} clamped nodes of contact sets penetrate "
+            f"what they may touch, deepest node {node} of {sorted(scene.contact)[number]!r} by "
+            f"{float(-np.asarray(pairs.gap)[held[worst]]):.3g} m; move the obstacle"
+        )
+    return moving
 
 
 def _obstacle_pairs(

@@ -25,6 +25,7 @@ from jaxcontact.system.parts import Parts
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.show import shown_by
 from jaxcontact.transforms.traced import as_array, take_rows
 
 
@@ -98,10 +99,28 @@ class System:
     frames: Frames | None = None
     """The frames of the bodies that turn (see `Scene.large_rotation`); None is none."""
 
+    def _facts(self) -> dict[str, object]:
+        return {
+            "dimension": self.dimension,
+            "unknowns": self.size,
+            "nodes": self.n_nodes,
+            "clamped_nodes": self.n_nodes - len(self.free_nodes),
+            "contact_pairs": self.normals.count,
+            "is_reduced": self.basis is not None,
+            "dtype": self.dtype.name,
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
+
     @property
     def size(self) -> int:
         """Number of unknowns, n."""
         return self.load.shape[-1]
+
+    @property
+    def mark(self) -> str:
+        """What the unknowns stand for: the fingerprint of the basis, empty for a full model."""
+        return "" if self.basis is None else self.basis.mark
 
     @property
     def n_nodes(self) -> int:

@@ -9,6 +9,21 @@ import textwrap
 MAX_QUOTE = 80
 
 
+def check_kind(call: str, value: object, kind: type, made_by: str) -> None:
+    """Raise a ValueError if the first argument of a call is not what an earlier call makes.
+
+    Args:
+        call: the name of the call, for instance "prepare".
+        value: what the user handed over.
+        kind: what it should be.
+        made_by: the line that makes it, for instance "jc.discretize(scene)".
+    """
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{call} takes a {kind.__name__}, got a {type(value).__name__}; first write {made_by}"
+        )
+
+
 def check_option(name: str, value: object, protocol: type | tuple[type, ...], example: str) -> None:
     """Raise a ValueError if an option is not an object with what its protocol asks for.
 

@@ -7,6 +7,9 @@ from support.independent import assemble, tracking_cost
 
 import jaxcontact as jc
 
+#: What is said of a force that chatters is in `test_chatter.py`.
+pytestmark = pytest.mark.filterwarnings("ignore::jaxcontact.ChatterWarning")
+
 STEPS = 5
 ALPHA, GAMMA = 0.3, 0.7
 # Sums of a few thousand products.

@@ -14,6 +14,9 @@ mpl.use("Agg")
 
 from matplotlib import pyplot
 
+#: The motions chatter, and `test_chatter.py` says what is said then.
+pytestmark = pytest.mark.filterwarnings("ignore::jaxcontact.ChatterWarning")
+
 STEPS, DT = 12, 5e-5
 
 

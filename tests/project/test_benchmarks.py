@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-#: Columns whose values the README quotes.
+#: Columns whose values the documentation quotes.
 RESULTS = {
     "step_cost": ["step_us", "limit_us", "step_over_limit"],
     "against_numpy": ["forward_superlu_over_ours", "gradient_superlu_over_ours"],

@@ -1,7 +1,10 @@
 import csv
 import json
 import os
+import signal
+import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 
 import jax.numpy as jnp
@@ -10,7 +13,8 @@ import pytest
 
 import jaxcontact as jc
 from jaxcontact import cli
-from jaxcontact.cli import METHODS, main
+from jaxcontact.cli import half_disc, main
+from jaxcontact.output.page import CAPTIONS
 
 TINY = ["half-disc", "--h", "3.75", "--steps", "12", "--gap", "0.01", "--iterations", "3"]
 PICTURES = {
@@ -23,6 +27,7 @@ PICTURES = {
         "contact-force",
         "energy",
         "active-set",
+        "stress",
     )
 }
 
@@ -57,6 +62,8 @@ def test_half_disc_succeeds_and_writes_everything(finished):
         "half-disc.pvd",
         "half-disc",
         "notes.txt",
+        "motion.gif",
+        "index.html",
         *PICTURES,
     }
 
@@ -127,13 +134,14 @@ def test_half_disc_without_matplotlib_writes_the_rest_and_says_how_to_install_it
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main([*TINY, "--out", str(tmp_path)]) == 0
     written = {path.name for path in tmp_path.iterdir()}
+    assert "index.html" not in written
     assert {"history.csv", "control.npz", "half-disc.pvd"} <= written
     assert not PICTURES & written
     assert "pip install 'jaxcontact[plot]'" in capsys.readouterr().out
 
 
 def test_half_disc_interrupted_writes_what_there_is(tmp_path, monkeypatch, capsys):
-    distance, calls = cli._distance, []
+    distance, calls = half_disc.distance, []
 
     def interrupt_second_iteration(*arguments):
         calls.append(arguments)
@@ -141,13 +149,97 @@ def test_half_disc_interrupted_writes_what_there_is(tmp_path, monkeypatch, capsy
             raise KeyboardInterrupt
         return distance(*arguments)
 
-    monkeypatch.setattr(cli, "_distance", interrupt_second_iteration)
+    monkeypatch.setattr(half_disc, "distance", interrupt_second_iteration)
     assert main([*TINY, "--out", str(tmp_path)]) == 130
     history = read_history(tmp_path)
     assert len(history["iteration"]) == 3
     assert np.isnan(history["distance_to_reference"][-1])
     assert {path.name for path in tmp_path.iterdir()} >= {"control.npz", *PICTURES}
     assert "interrupted" in capsys.readouterr().out
+
+
+def test_half_disc_page_shows_every_picture_with_its_caption(finished):
+    page = (finished[1] / "index.html").read_text(encoding="utf-8")
+    assert set(CAPTIONS) == PICTURES | {"motion.gif"}
+    for name, (title, *_) in CAPTIONS.items():
+        assert f'<img src="{name}" alt="{title}">' in page
+    assert "value at the result" in page
+
+
+def test_half_disc_removes_the_time_series_of_a_longer_run(finished):
+    folder = finished[1] / "half-disc"
+    stale = folder / "half-disc_149.vtu"
+    stale.write_text("old")
+    assert main([*TINY, "--out", str(finished[1])]) == 0
+    assert not stale.exists()
+    assert len(list(folder.iterdir())) == 13
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError("lost")])
+def test_half_disc_that_ends_after_the_optimisation_keeps_control_and_history(
+    error, tmp_path, monkeypatch, capsys
+):
+    def stop(*_):
+        raise error
+
+    monkeypatch.setattr(jc, "energy", stop, raising=False)
+    assert main([*TINY, "--out", str(tmp_path)]) == (130 if error is KeyboardInterrupt else 1)
+    assert len(read_history(tmp_path)["value"]) == 4
+    assert np.load(tmp_path / "control.npz")["control"].any()
+    assert "  control.npz\n" in capsys.readouterr().out
+
+
+def test_half_disc_that_is_killed_in_the_optimisation_has_kept_control_and_history(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("jaxcontact.cli.output.PERIOD", 0.0)
+
+    def die(_):
+        rows = (tmp_path / "history.csv").read_text().splitlines()
+        assert len(rows) == 3
+        assert rows[2].startswith("1,")
+        assert np.load(tmp_path / "control.npz")["control"].any()
+        raise SystemExit(9)
+
+    def die_in_the_third(*arguments):
+        calls.append(arguments)
+        return die(arguments) if len(calls) == 3 else before(*arguments)
+
+    calls, before = [], half_disc.distance
+    monkeypatch.setattr(half_disc, "distance", die_in_the_third)
+    with pytest.raises(SystemExit, match="9"):
+        main([*TINY, "--out", str(tmp_path)])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGINT for other processes")
+@pytest.mark.parametrize("pause", [0.0, 0.1, 1.0])
+def test_half_disc_that_is_interrupted_twice_keeps_control_and_history(pause, tmp_path):
+    program = "import sys; from jaxcontact.cli import main; sys.exit(main())"
+    words = [*TINY[:-1], "1000000", "--method", "adam", "--out", str(tmp_path)]
+    with subprocess.Popen([sys.executable, "-c", program, *words]) as run:
+        history = tmp_path / "history.csv"
+        while not history.exists() or history.read_text().count("\n") < 4:
+            assert run.poll() is None
+            time.sleep(0.1)
+        for _ in range(2):
+            run.send_signal(signal.SIGINT)
+            time.sleep(pause)
+        assert run.wait() == 130
+    assert len(read_history(tmp_path)["value"]) > 1
+    assert np.load(tmp_path / "control.npz")["control"].any()
+
+
+def test_help_needs_no_jax():
+    program = (
+        "import sys, jaxcontact.cli\n"
+        "try: jaxcontact.cli.main(['half-disc', '--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'jax', 'numpy', 'scipy', 'optax'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--iterations" in done.stdout
 
 
 def test_half_disc_unsolved_step_ends_with_its_message(tmp_path, monkeypatch, capsys):
@@ -189,7 +281,7 @@ def test_half_disc_whose_file_is_a_folder_ends_with_one_line_and_what_was_writte
 
 @pytest.mark.parametrize("large", [["--h", "1e-9"], ["--h", "5e-324"], ["--steps", "1000000000"]])
 def test_half_disc_that_no_memory_holds_ends_with_one_line(large, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "available_memory", lambda: 10**11)
+    monkeypatch.setattr(half_disc, "available_memory", lambda: 10**11)
     assert main(["half-disc", "--out", str(tmp_path), *large]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "GB of memory, and 1e+02 GB are free; choose a larger --h or fewer --steps" in line
@@ -197,8 +289,8 @@ def test_half_disc_that_no_memory_holds_ends_with_one_line(large, tmp_path, monk
 
 def test_half_disc_is_not_refused_where_the_memory_is_unknown_or_holds_it(monkeypatch):
     for free in (None, 3 * 10**7):
-        monkeypatch.setattr(cli, "available_memory", lambda free=free: free)
-        cli._check_room(1.25, 150)
+        monkeypatch.setattr(half_disc, "available_memory", lambda free=free: free)
+        half_disc.check_room(1.25, 150)
 
 
 @pytest.mark.parametrize(
@@ -230,16 +322,18 @@ def test_out_that_is_a_file_ends_with_code_2_and_keeps_the_file(tmp_path, capsys
     with pytest.raises(SystemExit) as stop:
         main([*TINY, "--out", str(file)])
     assert stop.value.code == 2
-    assert "--out: cannot make the folder" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "--out: cannot make the folder" in said
+    assert said.startswith("usage: jaxcontact half-disc ")
     assert file.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", cli.METHODS)
 def test_every_method_lowers_a_quadratic(name, problem):
     result = jc.optimize(
         lambda u: jnp.vdot(u - 1.0, u - 1.0),
         jnp.zeros_like(problem.reference),
-        method=METHODS[name],
+        method=half_disc.METHODS[name],
         system=problem.system,
         dt=problem.dt,
         iterations=2,

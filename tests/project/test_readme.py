@@ -25,6 +25,14 @@ def test_readme_example_runs_as_printed_and_prints_what_the_text_says(tmp_path):
     assert f"`{done.stdout.strip()}`" in README
 
 
+def test_readme_is_short():
+    assert len(README.split()) < 500
+
+
+def test_pictures_of_the_readme_are_there():
+    assert all((ROOT / name).is_file() for name in re.findall(r"!\[.*?\]\((.*?)\)", README))
+
+
 def test_readme_commands_install_extras_that_exist():
     commands = blocks("sh")
     extras = set(re.findall(r"\.\[(\w+)\]", " ".join(commands)))

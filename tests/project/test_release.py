@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import jaxcontact
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 #: What the tests, the notebooks and the benchmarks read.
@@ -82,9 +84,17 @@ def test_release_has_one_version_and_date():
     version, date = re.findall(r"^## \[(\d.*)\] - (\S+)$", changelog, re.MULTILINE)[0]
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     cited = dict(re.findall(r'^([a-z-]+): "?([^"\n]+)"?$', citation, re.MULTILINE))
-    assert version == cited["version"] == PROJECT["version"]
+    assert version == cited["version"] == PROJECT["version"] == jaxcontact.__version__
     assert date == cited["date-released"]
     assert cited["license"] == PROJECT["license"]
+
+
+def test_public_workflow_tests_three_systems_and_both_ends_of_the_versions():
+    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+    for word in ("ubuntu", "macos", "windows", "lowest-direct", "highest", "python -m pytest"):
+        assert word in workflow
+    lowest = PROJECT["requires-python"].removeprefix(">=")
+    assert f'"{lowest}"' in workflow
 
 
 @pytest.fixture(scope="module")

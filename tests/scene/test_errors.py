@@ -57,11 +57,6 @@ def test_scene_with_cells_in_no_or_two_regions_counts_them():
         discretize(mesh=mesh, material={"first": VISCOUS, "second": VISCOUS})
 
 
-def test_scene_with_overlapping_clamped_and_contact_sets_names_both():
-    with pytest.raises(ValueError, match=r"'bottom'.*'left'.*share 1 node"):
-        discretize(clamped=("left",))
-
-
 def test_scene_with_clamped_given_as_a_string_shows_the_tuple():
     with pytest.raises(ValueError, match=r"clamped=\('left',\)"):
         discretize(clamped="left")

@@ -13,6 +13,9 @@ from support.bodies import SCHEMES
 import jaxcontact as jc
 from jaxcontact.schemes.mass_redistribution import redistribute
 
+#: What is said of a force that chatters is in `test_chatter.py`.
+pytestmark = pytest.mark.filterwarnings("ignore::jaxcontact.ChatterWarning")
+
 by_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
 STEPS = 25
 SLANTED = (0.3, 1.0)
