@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
 from jaxcontact.contact.sweep_adjoint import solve_by_sweeps
 from jaxcontact.contact.sweeps import Equation, Fixed, contact_at, turned_form
 from jaxcontact.contact.vi import Bound, ContactProblem
+from jaxcontact.linear import Factor, can_condense
+from jaxcontact.linear.turned import TurnedFactor, turned_factor
 from jaxcontact.system.frames import Frames, FrameState, frame_start, next_frames, turn
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
@@ -113,6 +116,23 @@ def check_turning(contact_solver: ContactSolver) -> None:
             f"{contact_solver} is a law of the compliance of its pairs, which turns with the body; "
             "with large_rotation=True use jc.SemismoothNewton()"
         )
+
+
+def turning_factor(
+    factor: Factor, contact_solver: ContactSolver, weights: Array, places: np.ndarray | None
+) -> TurnedFactor:
+    """Return the factor for contact rows (C, d) that turn; see `turned_factor`.
+
+    Raises:
+        ValueError: if the solvers do not know contact rows that turn.
+    """
+    if not can_condense(factor):
+        raise ValueError(
+            "conjugate gradients do not know normals that turn; with large_rotation=True prepare "
+            "with linear_solver=jc.NestedDissection()"
+        )
+    check_turning(contact_solver)
+    return turned_factor(factor, weights, places)
 
 
 def turned_problem(problem: ContactProblem, normals: ContactNormals) -> ContactProblem:

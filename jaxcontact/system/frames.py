@@ -24,6 +24,7 @@ from jax import Array
 
 from jaxcontact.scene.obstacle import Obstacle
 from jaxcontact.system.small_matrices import axial, cayley, half_cayley, product, skew, solve_small
+from jaxcontact.system.sparse import ContactNormals
 
 #: Sweeps over (1) for each sweep over the step: an error falls by the strain of a step in each.
 INNER_SWEEPS = 2
@@ -86,6 +87,10 @@ class Frames:
 
     meetings: tuple[Meeting, ...]
     """Which pairs meet which obstacle; the gaps of bodies without frame stay linearised."""
+
+    def nodal_rows(self, dtype: np.dtype) -> ContactNormals:
+        """Return the components of the contact nodes as contact rows: normals of any direction."""
+        return ContactNormals(jnp.ones((len(self.unknowns), 1), dtype), self.unknowns[:, None])
 
     @property
     def is_concave(self) -> bool:
