@@ -110,7 +110,7 @@ def simulate(
         kinds = (WeakContact, AlongDirection)
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
     if progress is not None:
-        check_option("progress", progress, Progress, "Progress(every=100)")
+        check_option("progress", progress, Progress, "Progress()")
     initial = check_initial(start, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)
