@@ -37,6 +37,7 @@ from jaxcontact.motion.energy import Energy, energy
 from jaxcontact.motion.files import load_trajectory
 from jaxcontact.motion.linearization import linearization_error, turned_gap
 from jaxcontact.motion.memory import MemoryEstimate, estimate_memory
+from jaxcontact.motion.momentum import Momentum, momentum
 from jaxcontact.motion.pressure import contact_pressure
 from jaxcontact.motion.progress import Progress
 from jaxcontact.motion.schedule import Schedule, sample
@@ -126,6 +127,7 @@ __all__ = [
     "MemoryEstimate",
     "Mesh",
     "MeshQuality",
+    "Momentum",
     "NestedDissection",
     "NewtonCG",
     "OpenBranch",
@@ -181,6 +183,7 @@ __all__ = [
     "load_system",
     "load_trajectory",
     "meshes",
+    "momentum",
     "optimize",
     "phase_mean",
     "prepare",

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcontact.motion.linearization import linearization_error
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
-from jaxcontact.scene.facets import Facets
-from jaxcontact.scene.scene import Scene, contact_obstacles
+from jaxcontact.scene.scene import Scene
 
 #: Strain or rotation beyond which the linear theory is off by per cent.
 LARGEST_STRAIN = 0.1
 #: Fewest steps and cells of a contact that is resolved.
 FEWEST_STEPS, FEWEST_CELLS = 10, 2
-#: Time levels at which strains are looked at.
+#: Time levels at which strains and gaps are looked at.
 N_LEVELS = 50
 
 
@@ -31,19 +33,30 @@ def limits(
         h: mesh size, [m].
         tolerance: relative error that matters.
     """
+    seen = _thinned(trajectory)
     found = [
-        _strain(scene, trajectory),
-        _linearised_gap(scene, stepper, trajectory, tolerance),
+        _strain(scene, stepper, seen),
+        _linearised_gap(scene, seen, tolerance),
         _contact_width(stepper, trajectory, h),
         _contact_steps(trajectory),
     ]
     return tuple(sentence for sentence in found if sentence)
 
 
-def _strain(scene: Scene, trajectory: Trajectory) -> str:
-    cells, points = np.asarray(scene.mesh.cells), np.asarray(scene.mesh.points)
+def _thinned(trajectory: Trajectory) -> Trajectory:
+    """Return the motion at about `N_LEVELS` of its time levels."""
     stride = max(len(trajectory.unknowns) // N_LEVELS, 1)
-    y = np.asarray(trajectory.displacement[::stride])
+    levels = (trajectory.gap, trajectory.nodal, trajectory.frames)
+    gap, nodal, frames = jax.tree.map(lambda x: x[::stride], levels)
+    return replace(trajectory, gap=gap, nodal=nodal, frames=frames)
+
+
+def _strain(scene: Scene, stepper: Stepper, trajectory: Trajectory) -> str:
+    cells, points = np.asarray(scene.mesh.cells), np.asarray(scene.mesh.points)
+    y = trajectory.displacement
+    if trajectory.frames is not None:
+        y = stepper.system.lift(trajectory.frames.deformation)
+    y = np.asarray(y)
     edges = points[cells[:, 1:]] - points[cells[:, :1]]  # (E, d, d)
     stretch = y[:, cells[:, 1:]] - y[:, cells[:, :1]]  # (K, E, d, d)
     # grad y of (edge, component): edges @ grad = stretch.
@@ -59,29 +72,21 @@ def _strain(scene: Scene, trajectory: Trajectory) -> str:
     )
 
 
-def _linearised_gap(
-    scene: Scene, stepper: Stepper, trajectory: Trajectory, tolerance: float
-) -> str:
-    """Compare kappa |y_t|^2 / 2 with the displacement that matters."""
-    system = stepper.system
-    nodes, y = np.asarray(system.contact_nodes), trajectory.displacement
-    curvature = np.zeros(system.n_nodes)
-    for name, obstacle in contact_obstacles(scene):
-        if isinstance(obstacle, Facets):
-            continue
-        own = np.unique(scene.mesh.facets[name])
-        hessians = jax.vmap(jax.hessian(obstacle.signed_distance))(system.points[own])
-        curvature[own] = np.maximum(curvature[own], np.linalg.norm(hessians, ord=2, axis=(1, 2)))
-    if not nodes.size or not np.any(curvature[nodes] > 0.0):
+def _linearised_gap(scene: Scene, trajectory: Trajectory, tolerance: float) -> str:
+    """Compare the error of the linearised gap, where it can matter, with the tolerance."""
+    if trajectory.frames is not None:
         return ""
-    moved = jnp.max(jnp.sum(y[:, nodes] ** 2, axis=-1), axis=0)
-    error = float(np.max(0.5 * curvature[nodes] * np.asarray(moved)))
-    size = tolerance * float(jnp.max(jnp.abs(y)))
+    if trajectory.schedule is not None and trajectory.schedule.gap is not None:
+        return ""
+    errors = linearization_error(scene, trajectory)
+    # A pair that stays further away than its error would not have touched.
+    error = np.max(errors[errors > np.min(trajectory.gap, axis=0)], initial=0.0)
+    size = tolerance * float(jnp.max(jnp.abs(trajectory.displacement)))
     if error <= size:
         return ""
     return (
-        f"the gap is linearised where the body starts, and misses up to {error:.2g} m by the "
-        f"curvature of the obstacle, more than the {size:.2g} m that are asked for"
+        f"the gap is linearised where the body starts, and misses up to {error:.2g} m, more than "
+        f"the {size:.2g} m that are asked for"
     )
 
 

@@ -70,6 +70,9 @@ class Solution(NamedTuple):
     separation: PyTree = ()
     """b - N w, the velocity at which each pair separates, (C,); set by `ContactProblem.solve`."""
 
+    frames: PyTree = ()
+    """The frames of bodies that turn after the step, a `FrameState`; set by `TurningProblem`."""
+
     @property
     def weak(self) -> Array:
         """Pairs in weak contact, (C,) bool: active without a multiplier."""

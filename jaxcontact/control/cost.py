@@ -20,7 +20,7 @@ from jax.core import Tracer
 
 from jaxcontact.control.distance import NodalDistance, ReducedDistance, reduced_distance
 from jaxcontact.motion.chatter import warn_of_chatter
-from jaxcontact.motion.checks import check_every_step
+from jaxcontact.motion.checks import check_control, check_every_step
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.assembly import nodal_areas
 from jaxcontact.system.control_space import as_columns
@@ -73,6 +73,7 @@ class TrackingCost:
                 f"unknowns, (T+1, n) = (T+1, {system.size}), got {np.shape(target)}"
             )
         weights = _node_weights(system, facets, nodes)
+        self.mark = system.mark
         self.masses = (system.nodal_mass, system.l2_mass)
         self.distance = NodalDistance(system.nodal_mass, weights, target)
         self.reduced = None if system.basis is None else reduced_distance(system, self.distance)
@@ -86,31 +87,33 @@ class TrackingCost:
 
         Args:
             trajectory: states of T steps, of this system or of another model on its mesh.
-            control: the control that is penalised, (T, N, d) or (T, n), before any scaling; None
-                if there is none.
+            control: the control that is penalised, (T, N, d), or (T, n) in the unknowns of both
+                models, before any scaling; None if there is none.
 
         Raises:
             ValueError: if the trajectory or the control does not have the T steps of the target,
-                recorded one by one, or dt is not that of the trajectory (under jit the value is
-                NaN instead).
+                recorded one by one, a control in unknowns comes with a motion of another model, or
+                dt is not that of the trajectory (under jit the value is NaN instead).
         """
         check_every_step(trajectory)
         levels, *nodal = np.shape(self.distance.target)
+        is_of_model = trajectory.mark == self.mark
         # The unknowns know nothing of supports that a schedule moves.
         is_moved = trajectory.schedule is not None and bool(trajectory.schedule.motion)
-        is_reduced = self.reduced is not None and self.reduced.fits(trajectory.unknowns)
-        is_reduced = is_reduced and not is_moved
+        is_reduced = self.reduced is not None and is_of_model and not is_moved
         motion = trajectory.unknowns if is_reduced else trajectory.displacement
-        if np.shape(motion)[0] != levels or not (is_reduced or np.shape(motion)[1:] == (*nodal,)):
+        if len(motion) != levels or not (is_reduced or motion.shape[1:] == (*nodal,)):
             raise ValueError(
                 f"the trajectory has displacements {np.shape(trajectory.displacement)}, the target "
                 f"{(levels, *nodal)}; both must hold the same T+1 time levels"
             )
-        shapes = ((levels - 1, *nodal), (levels - 1, self.masses[1].size))
-        if control is not None and np.shape(control) not in shapes:
-            raise ValueError(
-                f"control must have shape {shapes[0]} or {shapes[1]}, got {np.shape(control)}"
-            )
+        if control is not None:
+            check_control(control, (*nodal,), self.masses[1].size, levels - 1)
+            if np.ndim(control) == 2 and not is_of_model:
+                raise ValueError(
+                    "the motion is one of another model than the cost, and a control (T, n) is in "
+                    "the unknowns of one of them; make the cost of the system that is simulated"
+                )
         return _tracking_cost(
             self.reduced if is_reduced else self.distance,
             _step_length(trajectory, self.dt),
@@ -121,15 +124,16 @@ class TrackingCost:
             control,
         )
 
-    def tree_flatten(self) -> tuple[list, tuple[str, ...]]:
-        """Return the fields and their names."""
-        return list(vars(self).values()), tuple(vars(self))
+    def tree_flatten(self) -> tuple[list, tuple[str, tuple[str, ...]]]:
+        """Return the arrays, and the mark with the names of the arrays."""
+        arrays = {name: value for name, value in vars(self).items() if name != "mark"}
+        return list(arrays.values()), (self.mark, tuple(arrays))
 
     @classmethod
-    def tree_unflatten(cls, names: tuple[str, ...], values) -> TrackingCost:
-        """Return the functional of the fields."""
-        cost = object.__new__(cls)
-        vars(cost).update(zip(names, values, strict=True))
+    def tree_unflatten(cls, static: tuple[str, tuple[str, ...]], values) -> TrackingCost:
+        """Return the functional of its arrays."""
+        cost, (mark, names) = object.__new__(cls), static
+        vars(cost).update(zip(names, values, strict=True), mark=mark)
         return cost
 
 

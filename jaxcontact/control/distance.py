@@ -19,7 +19,7 @@ from jax import Array
 
 from jaxcontact.control.inner_product import nodal_norms
 from jaxcontact.system.control_space import control_loads
-from jaxcontact.system.sparse import SymmetricMatrix
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced
@@ -52,7 +52,7 @@ class ReducedDistance:
     """Distance in the unknowns of a reduced model."""
 
     root: Array
-    """R, (m, n)."""
+    """R, (m, n); a number stands for that multiple of the identity."""
 
     target: Array
     """R q_d, (T+1, m)."""
@@ -60,13 +60,10 @@ class ReducedDistance:
     rest: Array
     """c, the part of the target outside of the space, (T+1,)."""
 
-    def fits(self, unknowns: Array) -> bool:
-        """Return whether these are unknowns of the model, by their number."""
-        return unknowns.shape[-1] == self.root.shape[1]
-
     def squares(self, unknowns: Array) -> Array:
         """Return the squared distances (T+1,) of unknowns (T+1, n)."""
-        return jnp.sum((unknowns @ self.root.T - self.target) ** 2, axis=1) + self.rest
+        rooted = unknowns @ self.root.T if self.root.ndim else self.root * unknowns
+        return jnp.sum((rooted - self.target) ** 2, axis=1) + self.rest
 
 
 @in_full_precision
@@ -74,13 +71,18 @@ def reduced_distance(system: System, distance: NodalDistance) -> ReducedDistance
     """Return the distance in the unknowns of a reduced system."""
     target = jnp.asarray(distance.target, system.dtype)
     if distance.weights is None:
-        root = jnp.linalg.cholesky(system.l2_mass.expand().to_dense()).T
-        pressed = jax.scipy.linalg.solve_triangular(
-            root.T, control_loads(system, target).T, lower=True
-        )
-        nearest = jax.scipy.linalg.solve_triangular(root, pressed).T
+        loads = control_loads(system, target)
+        if isinstance(system.l2_mass, ComponentwiseMatrix):
+            root = jnp.sqrt(system.l2_mass.scalar.values[0, 0])
+            rooted = loads / root
+            nearest = rooted / root
+        else:
+            root = jnp.linalg.cholesky(system.l2_mass.values).T
+            solve = jax.scipy.linalg.solve_triangular
+            rooted = solve(root.T, loads.T, lower=True).T
+            nearest = solve(root, rooted.T).T
         rest = nodal_norms(distance.nodal_mass, system.lift(nearest) - target)
-        return ReducedDistance(root, pressed.T, rest)
+        return ReducedDistance(root, rooted, rest)
     weights = distance.weights
     chosen = slice(None) if is_traced(weights) else np.flatnonzero(np.asarray(weights))
     scale = jnp.sqrt(weights[chosen])[None, :, None]

@@ -15,6 +15,7 @@ from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import State, Trajectory
 from jaxcontact.schemes.terms import gap_resolution
 from jaxcontact.system.pair_set import Pairs, PairSet
+from jaxcontact.system.placing import placed
 from jaxcontact.system.system import System
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import is_traced, poison_unless
@@ -44,7 +45,7 @@ def check_steps(
     if control is None and steps is None and scheduled is None:
         raise ValueError("give a control (T, N, d) or (T, n), a schedule, or the number of steps")
     if control is not None:
-        check_control(stepper.system, control)
+        check_control(control, stepper.system.points.shape, stepper.system.size)
         _check_finite("control", control)
         if steps is not None and steps != np.shape(control)[0]:
             raise ValueError(
@@ -64,14 +65,15 @@ def check_steps(
     return n_steps
 
 
-def check_control(system: System, control: Array) -> None:
-    """Check that a control has the shape (T, N, d) or, in unknowns, (T, n)."""
-    nodal = (system.n_nodes, system.dimension)
-    if np.shape(control)[1:] not in (nodal, (system.size,)):
+def check_control(
+    control: Array, nodal: tuple[int, ...], size: int, steps: int | None = None
+) -> None:
+    """Check the shape of a control: (T, N, d) with (N, d) = nodal, or (T, n) with n = size."""
+    shape, T = np.shape(control), "T" if steps is None else steps
+    if shape[1:] not in (nodal, (size,)) or steps not in (None, shape[0]):
         raise ValueError(
-            f"control must have shape (T, N, d) = (T, {nodal[0]}, {nodal[1]}), on all nodes, the "
-            f"clamped ones included, or in unknowns (T, n) = (T, {system.size}), got "
-            f"{np.shape(control)}"
+            f"control must have shape (T, N, d) = ({T}, {nodal[0]}, {nodal[1]}), on all nodes, the "
+            f"clamped ones included, or in unknowns (T, n) = ({T}, {size}), got {shape}"
         )
 
 
@@ -171,6 +173,8 @@ def _penetration(system: System, displacement: Array) -> Array:
     if system.basis is not None:
         normals, rest = system.basis.normals, (system.gap_rounding, system.contact_nodes)
         pairs = PairSet(normals, system.gap, *rest)
+    elif system.frames is not None:
+        pairs = placed(system, system.free_components(displacement))
     return depth(pairs, system.free_components(displacement))
 
 

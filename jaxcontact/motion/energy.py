@@ -18,6 +18,7 @@ from jax import Array
 
 from jaxcontact.motion.checks import check_control, check_every_step
 from jaxcontact.motion.drive import StepDrive, drive_of, every_step, flow_of_drive
+from jaxcontact.motion.frame_motion import FrameMotion
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.supports import Flow, Moves, support_energy
@@ -25,6 +26,7 @@ from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.terms import viscous_loss
 from jaxcontact.system.control_space import control_loads
+from jaxcontact.system.placing import placed
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -37,7 +39,7 @@ class Energy:
     """1/2 v.Mv, (T+1,) [J]."""
 
     elastic: Array
-    """1/2 y.Ay, (T+1,) [J]."""
+    """1/2 y.Ay, (T+1,) [J]; of bodies that turn 1/2 u.Au with the deformation u in their frames."""
 
     change: Array
     """E' - E of each step, (T,) [J], to the digits of the step: the difference of two `total` loses
@@ -83,15 +85,15 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     """
     check_every_step(trajectory)
     unknowns, system = trajectory.unknowns, stepper.system
-    if unknowns.shape[1:] != (system.size,):
+    if unknowns.shape[1:] != (system.size,) or trajectory.mark != system.mark:
         raise ValueError(
-            f"the trajectory has unknowns {unknowns.shape}, the system of the stepper "
-            f"{system.size}; hand over the stepper that made it"
+            f"the trajectory has {unknowns.shape[1]} unknowns, the system of the stepper "
+            f"{system.size} of its own; hand over the stepper that made it"
         )
     if control is not None:
-        check_control(system, control)
+        check_control(control, system.points.shape, system.size, len(unknowns) - 1)
     records = (unknowns, trajectory.rates, trajectory.contact_impulse)
-    return _ledger(stepper, *records, control, trajectory.schedule)
+    return _ledger(stepper, *records, control, trajectory.schedule, trajectory.frames)
 
 
 @in_full_precision
@@ -103,6 +105,7 @@ def _ledger(
     impulse: Array,
     control: Array | None,
     schedule: Schedule | None,
+    frames: FrameMotion | None,
 ) -> Energy:
     system, operators, dt = stepper.system, stepper.operators, stepper.dt
 
@@ -114,6 +117,7 @@ def _ledger(
         velocity=rates,
         impulse=nothing_yet(impulse),
         guesses=(),
+        frames=None if frames is None else frames.states,
     )
 
     drive = shapes = None
@@ -122,7 +126,7 @@ def _ledger(
 
     def measure(state: StepState, moves: Moves | None) -> tuple[Array, Array]:
         kinetic = 0.5 * jnp.dot(state.velocity, operators.mass @ state.velocity)
-        elastic = 0.5 * jnp.dot(state.displacement, system.stiffness @ state.displacement)
+        elastic = 0.5 * jnp.dot(state.deformation, system.stiffness @ state.deformation)
         if shapes is None or shapes.supports is None or moves is None:
             return kinetic, elastic
         more = support_energy(shapes.supports, state, moves)
@@ -130,15 +134,17 @@ def _ledger(
 
     def flow(old: StepState, new: StepState, added: Array | None, step: StepDrive | None) -> Flow:
         load = system.load if added is None else system.load + added
-        velocity, displacement = old.velocity + new.velocity, old.displacement + new.displacement
+        velocity, deformation = old.velocity + new.velocity, old.deformation + new.deformation
         increment = new.displacement - old.displacement
+        deforming = new.deformation - old.deformation
         change = 0.5 * (
             jnp.dot(new.velocity - old.velocity, operators.mass @ velocity)
-            + jnp.dot(increment, system.stiffness @ displacement)
+            + jnp.dot(deforming, system.stiffness @ deformation)
         )
-        losses = stepper.scheme.losses(system, operators, dt, old, new)
+        here = placed(system, old.displacement)
+        losses = stepper.scheme.losses(here, operators, dt, old, new)
         numerical = jnp.asarray(losses.numerical, change.dtype)
-        viscous = viscous_loss(system, dt, increment)
+        viscous = viscous_loss(system, dt, deforming)
         own = Flow(change, jnp.dot(increment, load), viscous, losses.impact, numerical)
         if shapes is None or step is None:
             return own

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from jaxcontact.motion.frame_motion import FrameMotion
 from jaxcontact.motion.nodal_fields import NodalFields, StoredFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.trajectory import ContactRecord, Trajectory
@@ -22,5 +23,7 @@ def load_trajectory(path: str | Path) -> Trajectory:
         ValueError: if the file is damaged or holds something else.
         RuntimeError: if it is in float64 while JAX has it switched off.
     """
-    saved = load_dataclass(path, (Trajectory, ContactRecord, Schedule, StoredFields, Lift))
+    saved = load_dataclass(
+        path, (Trajectory, ContactRecord, Schedule, StoredFields, Lift, FrameMotion)
+    )
     return replace(saved, nodal=NodalFields.from_stored(saved.nodal))

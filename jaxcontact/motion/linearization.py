@@ -40,10 +40,12 @@ def linearization_error(scene: Scene, trajectory: Trajectory) -> np.ndarray:
         trajectory: a motion; each recorded state is compared, so thin them out by save_every.
 
     Raises:
-        ValueError: if something is traced, or the trajectory was made with `Schedule.gap`.
+        ValueError: if something is traced, the trajectory was made with `Schedule.gap`, or bodies
+            turn.
     """
     if is_traced((scene, trajectory)):
         raise ValueError("linearization_error needs concrete values; call it outside of jax.jit")
+    _refuse_frames(scene)
     schedule, mesh = trajectory.schedule, scene.mesh
     if schedule is not None and schedule.gap is not None:
         raise ValueError("with Schedule.gap the place of the obstacle is not known")
@@ -91,10 +93,11 @@ def turned_gap(
 
     Raises:
         ValueError: if the contact set is unknown, meets another body or shares pairs with another
-            set, or a shape does not fit.
+            set, a shape does not fit, or bodies turn.
 
     Derivative: by rotation, translation, the point and the obstacle.
     """
+    _refuse_frames(scene)
     obstacles = scene.contact.get(name)
     if obstacles is None or isinstance(obstacles, Facets):
         raise ValueError(f"{name!r} is no contact set with a rigid obstacle")
@@ -126,6 +129,11 @@ def turned_gap(
         still = gap_to(obstacle, x, nu)
         change = change.at[:, rows].set(jax.vmap(gap)(turn, shift) - still[None])
     return change
+
+
+def _refuse_frames(scene: Scene) -> None:
+    if scene.large_rotation:
+        raise ValueError("with large_rotation=True gaps are those of the place, not linearised")
 
 
 def _pairs(scene: Scene) -> ContactPairs:

@@ -24,6 +24,7 @@ from jaxcontact.motion.drive import (
     shifted,
     show_motion,
 )
+from jaxcontact.motion.frame_motion import FrameMotion, check_frames, frame_motion
 from jaxcontact.motion.initial import first_displacement
 from jaxcontact.motion.memory import check_run_memory
 from jaxcontact.motion.nodal_fields import NodalFields
@@ -34,7 +35,9 @@ from jaxcontact.motion.supports import Moves
 from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
+from jaxcontact.schemes.turning import make_step
 from jaxcontact.system.control_space import control_loads
+from jaxcontact.system.placing import gap_and_rows
 from jaxcontact.transforms.options import check_kind, check_option
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import tangent_of
@@ -109,6 +112,7 @@ def simulate(
     if weak_contact is not None:
         kinds = (WeakContact, AlongDirection)
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
+    check_frames(stepper.system, schedule, weak_contact)
     if progress is not None:
         check_option("progress", progress, Progress, "Progress()")
     initial = check_initial(start, initial)
@@ -124,7 +128,8 @@ def simulate(
     nodal = NodalFields(stepper.system.lifting, values.pop("unknowns"), values.pop("rates"))
     if schedule is not None and moves is not None:
         nodal = show_motion(stepper.system, schedule, moves, nodal)
-    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule)
+    mark = stepper.system.mark
+    trajectory = Trajectory(**values, nodal=nodal, schedule=schedule, mark=mark)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
     return trajectory
@@ -143,6 +148,7 @@ class _Motion(NamedTuple):
     iterations: Array
     status: Array
     residual: Array
+    frames: FrameMotion | None
 
 
 @in_full_precision
@@ -190,7 +196,7 @@ def _run(
             now, more = apply_drive(stepper.scheme, system, dt, shapes, driven)
             load = load + more
         perturbed = perturbation.on(operators, dt)
-        result = stepper.scheme.step(now, perturbed, dt, state, load)
+        result = make_step(stepper.scheme, now, perturbed, dt, state, load)
         iterations, status, residual = _worst(result.solutions)
         result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
@@ -206,7 +212,7 @@ def _run(
     )
 
     displacement = jnp.concatenate([start.displacement[None], states.displacement])
-    gap = system.gap[None, :] - jax.vmap(lambda y: system.normals @ y)(displacement)
+    gap = jax.vmap(lambda y: gap_and_rows(system, y)[0])(displacement)
     moves = None
     if drive is not None:
         recorded = jax.tree.map(lambda x: x[::save_every], drive._replace(loads=None))
@@ -222,6 +228,7 @@ def _run(
         iterations=iterations,
         status=status,
         residual=residual,
+        frames=frame_motion(system, start, states, displacement),
     )
     return motion, moves
 

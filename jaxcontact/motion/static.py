@@ -100,14 +100,19 @@ def solve_static(
 
     Raises:
         ValueError: if an option is not an object of its kind, the solvers do not fit each other, a
-            body without clamped nodes is to be solved for with soft contact, or the stiffness
-            matrix is not positive definite.
+            body without clamped nodes is to be solved for with soft contact, the stiffness
+            matrix is not positive definite, or bodies turn.
         SolveError: if the result is concrete and was not solved, or there is no equilibrium.
         Both are NaN under jit or grad where only values decide.
 
     Derivative: reverse mode by every value of the system, on the active set. A change that pushes
     along a motion which nothing holds has no equilibrium, and no derivative either.
     """
+    if system.frames is not None:
+        raise ValueError(
+            "the static problem is one of small displacements; discretize the scene without "
+            "large_rotation=True"
+        )
     solvers = choose_solvers(system, linear_solver, contact_solver)
     loose = _loose_bodies(system)
     if not loose:

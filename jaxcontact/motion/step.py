@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxcontact.motion.simulate import simulate
@@ -49,7 +48,7 @@ def step(
     Args:
         stepper: from `prepare`.
         state: where the step starts; None is at rest. In a scan it needs both of its arrays.
-        control: force density u of the step, (N, d) [N/m^d]; None is none.
+        control: force density u of the step, (N, d) or (n,) [N/m^d]; None is none.
 
     Returns:
         The state after the step, and what else was found.
@@ -65,12 +64,6 @@ def step(
     if jax.tree.leaves(stepper.scheme.first_carry(stepper.system)):
         raise ValueError(
             f"{stepper.scheme} hands on more from step to step than a State holds; use simulate"
-        )
-    system = stepper.system
-    shape = (system.n_nodes, system.dimension)
-    if control is not None and np.shape(control) != shape:
-        raise ValueError(
-            f"the control of one step must have shape (N, d) = {shape}, got {np.shape(control)}"
         )
     controls = None if control is None else jnp.asarray(control)[None]
     motion = simulate(stepper, controls, steps=1, initial=state)

@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike
 
 from jaxcontact.scene.scene import Scene, cellwise_material, check_scene
 from jaxcontact.system.assembly import hat_gradients
+from jaxcontact.system.discretize import discretize
+from jaxcontact.system.placing import deformation
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.traced import as_array
 
@@ -95,11 +97,13 @@ def stress(scene: Scene, displacement: ArrayLike, velocity: ArrayLike | None = N
 
     Args:
         scene: the scene, for its mesh and material.
-        displacement: nodal displacement, (..., N, d) [m], of a state or a whole trajectory.
+        displacement: nodal displacement, (..., N, d) [m], of a state or a whole trajectory. With
+            `Scene.large_rotation` strain and stress are in the axes of the body that has turned.
         velocity: nodal velocity, (..., N, d) [m/s], for the viscous part; default none.
 
     Raises:
-        ValueError: if a shape does not fit the mesh, or as `check_scene`.
+        ValueError: if a shape does not fit the mesh, a velocity is given where bodies turn, or as
+            `check_scene`.
 
     Derivative: by displacement, velocity, material and node positions. The principal stresses have
     none where two of them are equal; where it is zero, that of the von Mises stress is zero.
@@ -113,6 +117,14 @@ def stress(scene: Scene, displacement: ArrayLike, velocity: ArrayLike | None = N
                 f"{name} has shape {np.shape(value)}; pass nodal vectors, (..., N, d) with "
                 f"(N, d) = {scene.mesh.points.shape}"
             )
+    if scene.large_rotation and scene.mesh.dimension > 1:
+        if velocity is not None:
+            raise ValueError(
+                "the viscous stress of bodies that turn is not known; with large_rotation=True "
+                "leave out the velocity"
+            )
+        displacement = jnp.asarray(displacement)
+        displacement = deformation(discretize(scene, displacement.dtype), displacement)
     return _stress(
         jnp.asarray(scene.mesh.points, jnp.result_type(displacement, jnp.float32)),
         np.asarray(scene.mesh.cells),

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,9 @@ LADDER = 10.0 ** -np.arange(4.0, 10.0)
 
 #: A certificate with fewer weak pairs is taken if its residual is less than this times the least.
 AS_GOOD = 10.0
+
+#: Which bounds hold depends on the multipliers of the weak gaps, and they on the bounds.
+MAX_HELD = 10
 
 
 @dataclass(frozen=True)
@@ -168,8 +171,8 @@ def _certify(
     )
     _, derivative, by_impulse = on_pattern(problem.objective, problem.controls, parameters, probe)
     by_impulse = np.asarray(by_impulse)[is_weak]
-    free = free_variables(problem.bounds, parameters, derivative)
-    rows = weak_rows(problem, motion, parameters, probe, is_weak, free)
+    rows = weak_rows(problem, motion, parameters, probe, is_weak)
+    rows = _with_held(rows, parameters, derivative)
     multiplier, signs, excess, rest = _multipliers(rows, derivative, by_impulse)
     gradient = problem.riesz(rest)
     step = parameters - problem.project(parameters - gradient)
@@ -188,6 +191,18 @@ def _certify(
         rank=rows.rank,
         condition=rows.condition,
     )
+
+
+def _with_held(rows: WeakRows, parameters: Array, derivative: Array) -> WeakRows:
+    """Return the rows with the parameters that no bound holds, by the sign of dL/du."""
+    bounds, rest = rows.problem.bounds, derivative
+    for _ in range(MAX_HELD if bounds is not None else 0):
+        free = free_variables(bounds, parameters, rest)
+        if rows.free is not None and bool(jnp.all(free == rows.free)):
+            break
+        rows = replace(rows, free=free)
+        _, rest = rows.multipliers(derivative)
+    return rows
 
 
 def motion_of(problem: Problem) -> Callable[[Array], Trajectory] | None:

@@ -138,6 +138,6 @@ class ExactFinish:
             step, _, is_cut = path.cut(math.inf)
             if is_cut:  # negative curvature: no minimiser on this pattern
                 break
-            curvature = min(x.curvature / x.direction_square for x in path.segments)
-            found = fixed.at(found.parameters + step, found, curvature)
+            curvature = path.least_curvature
+            found = fixed.at(found.parameters + step + found.to_bounds, found, curvature)
         return found

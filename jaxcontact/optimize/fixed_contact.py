@@ -53,6 +53,9 @@ class Candidate(NamedTuple):
     rows: WeakRows
     """The weak gaps, with the parameters that no bound holds."""
 
+    to_bounds: Array | float = 0.0
+    """Step that puts the others on their bounds."""
+
 
 @dataclass(frozen=True)
 class FixedContact:
@@ -112,8 +115,11 @@ class FixedContact:
             last: where the step to them began.
             curvature: least curvature that was met, for the bounds that hold.
         """
-        rows = self.rows if last is None else last.rows
         parameters = self.exact.project(parameters)
+        rows = self.rows if last is None else last.rows
+        if last is None and self.exact.bounds is not None:
+            lower, upper = self.exact.bounds
+            rows = replace(rows, free=(parameters > lower) & (parameters < upper))
         gaps = np.asarray(self._trajectory(parameters).contact.gap)[self.pattern.weak]
         parameters = self.exact.project(parameters + rows.correct(-gaps))
         self.exact.counts.evaluations += 1
@@ -121,13 +127,15 @@ class FixedContact:
             self.exact.objective, self.exact.controls, parameters, self.probe
         )
         nu, rest = rows.multipliers(derivative)
+        to_bounds = 0.0
         if self.exact.bounds is not None:
-            rows = replace(rows, free=self._free(parameters, rest, curvature))
+            free, to_bounds = self._held(parameters, rest, curvature)
+            rows = replace(rows, free=free)
             nu, rest = rows.multipliers(derivative)
         step = parameters - self.exact.project(parameters - self.exact.riesz(rest))
         residual = math.sqrt(max(float(self.exact.dot(step, step)), 0.0))
         by_weak_impulse = np.asarray(by_impulse)[self.pattern.weak]
-        return Candidate(parameters, rest, residual, nu, by_weak_impulse, rows)
+        return Candidate(parameters, rest, residual, nu, by_weak_impulse, rows, to_bounds)
 
     def signs(self, found: Candidate) -> Signs:
         """Return what is wrong with the pattern at a candidate."""
@@ -147,13 +155,16 @@ class FixedContact:
             np.where(~strong & ~weak & (inside > ROUNDING), inside, 0.0),
         )
 
-    def _free(self, parameters: Array, rest: Array, curvature: float | None) -> Array | None:
-        """Return the parameters that no bound holds, bool."""
+    def _held(
+        self, parameters: Array, rest: Array, curvature: float | None
+    ) -> tuple[Array | None, Array | float]:
+        """Return the parameters that no bound holds, bool, and the step of the others to theirs."""
         if self.exact.bounds is None or curvature is None:
-            return free_variables(self.exact.bounds, parameters, rest)
+            return free_variables(self.exact.bounds, parameters, rest), 0.0
         lower, upper = self.exact.bounds
         target = parameters - self.exact.riesz(rest) / curvature
-        return (target > lower) & (target < upper)
+        free = (target > lower) & (target < upper)
+        return free, jnp.where(free, 0.0, self.exact.project(target) - parameters)
 
     def _trajectory(self, parameters: Array) -> Trajectory:
         self.exact.counts.motions += 1

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import RelaxedContact
@@ -23,6 +24,7 @@ from jaxcontact.control.problem import Point, Problem
 from jaxcontact.motion.stepper import with_contact
 from jaxcontact.optimize.certificate import motion_of
 from jaxcontact.optimize.finish import ExactFinish
+from jaxcontact.optimize.interior import Duals, Interior, snapped, well_inside
 from jaxcontact.optimize.method import Ending
 from jaxcontact.optimize.newton_cg import NewtonCG, NewtonCGState
 from jaxcontact.optimize.pattern import identify
@@ -65,7 +67,7 @@ class HomotopyState(NamedTuple):
     """Radius of the trust region."""
 
     first_norm: float
-    """Gradient norm of the exact problem at the start; of the relaxed one if that is zero."""
+    """Gradient norm of the exact problem at the start, bounds aside; of the relaxed one if zero."""
 
     norm: float
     """Gradient norm of the last relaxed problem at its solution."""
@@ -75,6 +77,9 @@ class HomotopyState(NamedTuple):
 
     before: Array
     """Parameters of the relaxed minimiser before that."""
+
+    duals: Duals | None = None
+    """Multipliers of the bounds at the last relaxed minimiser, or None without bounds."""
 
     finish_level: int = 0
     """The level after which the finish was tried last."""
@@ -128,9 +133,12 @@ class Homotopy:
 
     def init(self, problem: Problem, point: Point) -> HomotopyState:
         """Return the state at the start."""
-        norm = float(problem.gradient_norm(point))
-        start = point.parameters
-        return HomotopyState(point, 0, 0.0, math.inf, norm, norm, start, start)
+        norm = math.sqrt(max(float(jnp.vdot(point.derivative, point.gradient)), 0.0))
+        start, duals = point.parameters, None
+        if problem.bounds is not None:
+            start = well_inside(problem.bounds, start)
+            duals = Duals(0.0, start, start, 0.0)
+        return HomotopyState(point, 0, 0.0, math.inf, norm, norm, start, start, duals)
 
     def step(self, problem: Problem, state: HomotopyState) -> tuple[HomotopyState, Ending | None]:
         """Return the state after the next kappa or the finish, or why it is the last."""
@@ -144,9 +152,7 @@ class Homotopy:
                 return self._finished(problem, state, finish, motion), None
         if state.level == self.levels:
             return state, Ending.RELAXED
-        # With bounds the finish may fail: which of them hold, the path tells less well.
-        is_loose = finish is not None and motion is not None and problem.bounds is None
-        return self._next_level(problem, state, is_loose)
+        return self._next_level(problem, state, finish is not None and motion is not None)
 
     def _next_level(
         self, problem: Problem, state: HomotopyState, is_loose: bool
@@ -154,14 +160,22 @@ class Homotopy:
         """Return the state after the next kappa."""
         kappa = self.reduction * state.kappa if state.level else self.first_kappa
         if kappa is None:
-            kappa, relaxed, start = _first_relaxation(problem, state.point)
+            kappa, relaxed, start = _first_relaxation(problem, state)
         else:
             relaxed = _relax(problem, kappa)
             start = relaxed.evaluate(state.relaxed)
+        if state.duals is not None:
+            duals = state.duals._replace(mu=self.reduction * state.duals.mu)
+            relaxed, start = (
+                Interior.after(relaxed, start, duals)
+                if state.level
+                else Interior.of(relaxed, start)
+            )
         if not math.isfinite(start.value):
             return state, Ending.RELAXED_NOT_FINITE
         if state.level >= FIRST_EXTRAPOLATED:
             start = _extrapolated(relaxed, state, kappa, self.reduction, start)
+            relaxed, start = _centred(relaxed, start)
         # Before touch the exact gradient can be zero where the relaxed one is not.
         first_norm = state.first_norm or float(relaxed.gradient_norm(start))
         tolerance = self.tolerance
@@ -177,7 +191,8 @@ class Homotopy:
                 following = _newton_step(relaxed, inner)
             if following is None:
                 break
-            inner = following
+            relaxed, centred = _centred(relaxed, following.point, following.curvature)
+            inner = following._replace(point=centred)
         return state._replace(
             point=problem.evaluate(inner.point.parameters),
             level=state.level + 1,
@@ -187,6 +202,7 @@ class Homotopy:
             norm=float(relaxed.gradient_norm(inner.point)),
             relaxed=inner.point.parameters,
             before=state.relaxed,
+            duals=relaxed.barrier.duals if isinstance(relaxed, Interior) else None,
         ), None
 
     def _finished(
@@ -195,7 +211,8 @@ class Homotopy:
         """Return the state after the finish from the last two minimisers."""
         levels = (state.kappa / self.reduction, state.before), (state.kappa, state.relaxed)
         pattern = identify(problem, motion, levels)
-        end = finish.run(problem, motion, state.relaxed, pattern, state.first_norm)
+        start = snapped(problem.bounds, state.relaxed, state.before, self.reduction)
+        end = finish.run(problem, motion, start, pattern, state.first_norm)
         point = problem.evaluate(end.parameters)
         return state._replace(
             point=point if end.is_right or point.value < state.point.value else state.point,
@@ -210,8 +227,16 @@ def _extrapolated(
     """Return the better one of a start and the point ahead on the path, linear in sqrt(kappa)."""
     root, last, before = (math.sqrt(x) for x in (kappa, state.kappa, state.kappa / reduction))
     share = (root - last) / (last - before)
-    ahead = relaxed.evaluate(state.relaxed + share * (state.relaxed - state.before))
+    target = state.relaxed + share * (state.relaxed - state.before)
+    ahead = relaxed.evaluate(relaxed.project(target))
     return ahead if ahead.value < start.value else start
+
+
+def _centred(
+    relaxed: Problem, point: Point, curvature: float | None = None
+) -> tuple[Problem, Point]:
+    """Return problem and point after a step to it; only a barrier changes with the iterate."""
+    return relaxed.moved(point, curvature) if isinstance(relaxed, Interior) else (relaxed, point)
 
 
 def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None:
@@ -220,8 +245,6 @@ def _newton_step(problem: Problem, state: NewtonCGState) -> NewtonCGState | None
     At the last digits the value is rounding and hides the descent; the gradient still shows it.
     """
     point = state.point
-    if problem.bounds is not None:
-        return None
     path = conjugate_gradient_path(
         point.derivative,
         problem.hessian(point.parameters),
@@ -244,15 +267,15 @@ def _relax(problem: Problem, kappa: float) -> Problem:
     return replace(problem, objective=with_contact(problem.objective, RelaxedContact(kappa)))
 
 
-def _first_relaxation(problem: Problem, point: Point) -> tuple[float, Problem, Point]:
+def _first_relaxation(problem: Problem, state: HomotopyState) -> tuple[float, Problem, Point]:
     """Return the kappa that changes the objective at the start by about `FIRST_CHANGE`.
 
     With it come the relaxed problem and its point at the start.
     """
-    kappa, value = 1.0, float(point.value)
+    kappa, value = 1.0, float(state.point.value)
     for _ in range(MAX_TRIALS):
         relaxed = _relax(problem, kappa)
-        start = relaxed.evaluate(point.parameters)
+        start = relaxed.evaluate(state.relaxed)
         change = abs(float(start.value) - value) / max(abs(value), 1e-300)
         factor = FIRST_CHANGE / max(change, 1e-300) if math.isfinite(change) else 0.0
         if 0.2 <= factor <= 5.0:

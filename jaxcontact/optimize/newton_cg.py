@@ -37,6 +37,9 @@ class NewtonCGState(NamedTuple):
     first_norm: float
     """Gradient norm at the start, to which the accuracy of CG refers."""
 
+    curvature: float = 1.0
+    """Least curvature s.Hs / |s|_M^2 that conjugate gradients met in the last iteration."""
+
 
 @dataclass(frozen=True)
 class NewtonCG:
@@ -63,7 +66,7 @@ class NewtonCG:
 
     def step(self, problem: Problem, state: NewtonCGState) -> tuple[NewtonCGState, Ending | None]:
         """Return the next state, or why there is none."""
-        point, radius, first_norm = state
+        point, radius, first_norm, _ = state
         value = float(point.value)
         free = free_variables(problem.bounds, point.parameters, point.derivative)
         derivative = mask(free, point.derivative)
@@ -97,7 +100,7 @@ class NewtonCG:
             elif ratio > 0.75 and is_cut:
                 radius = 2.0 * radius
             if ratio >= self.acceptance and trial.value < value:
-                return NewtonCGState(trial, radius, first_norm), None
+                return NewtonCGState(trial, radius, first_norm, path.least_curvature), None
         return state, Ending.NO_DESCENT
 
 

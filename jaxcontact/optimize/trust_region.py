@@ -60,6 +60,11 @@ class Path(NamedTuple):
     segments: list[Segment]
     """In the order of the path."""
 
+    @property
+    def least_curvature(self) -> float:
+        """The least p.Hp / |p|_M^2 of the path."""
+        return min(x.curvature / x.direction_square for x in self.segments)
+
     def cut(self, radius: float) -> tuple[Array, float, bool]:
         """Return the end of the path in the ball, the model decrease, and if the ball cut it."""
         step, decrease = jnp.zeros_like(self.segments[0].direction), 0.0

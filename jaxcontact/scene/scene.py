@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxcontact.scene.compound import Along
 from jaxcontact.scene.facets import Facets, check_each_interface_once, check_facets
 from jaxcontact.scene.material import KelvinVoigt, check_material
 from jaxcontact.scene.mesh import Mesh
@@ -53,6 +54,10 @@ class Scene:
     (d,) of any positive length, or None for the normal of the facets: rollers, planes of symmetry,
     slanted guides. A node on the edge of two sets, or of one set with an edge of more than 40
     degrees, is held in the directions of both."""
+
+    large_rotation: bool = field(default=False, metadata={"static": True})
+    """Whether bodies without clamps may turn by any angle, at small strain: each then deforms in a
+    frame of its own, and meets its obstacles where it is. In one dimension nothing turns."""
 
 
 def check_scene(scene: Scene) -> None:
@@ -115,6 +120,8 @@ def check_scene(scene: Scene) -> None:
             raise ValueError(
                 f"rollers[{name!r}] must not be the zero vector; None takes the normals of the set"
             )
+    if scene.large_rotation:
+        _check_large_rotation(scene)
     _check_materials(scene)
 
 
@@ -174,6 +181,21 @@ def _check_vector(name: str, vector: ArrayLike, dimension: int) -> None:
         raise ValueError(f"{name} must have shape ({dimension},), got {vector.shape}")
     if not is_traced(vector) and not np.all(np.isfinite(np.asarray(vector))):
         raise ValueError(f"{name} must be finite, got {vector}")
+
+
+def _check_large_rotation(scene: Scene) -> None:
+    for name, obstacle in contact_obstacles(scene):
+        if isinstance(obstacle, Facets | Along):
+            raise ValueError(
+                f"contact[{name!r}] is {type(obstacle).__name__}, which knows the reference "
+                "configuration only; with large_rotation=True a contact set takes obstacles by "
+                "their signed distance, such as jc.HalfSpace"
+            )
+    if scene.rollers:
+        raise ValueError(
+            f"the rollers {sorted(scene.rollers)} hold directions in space, but bodies turn with "
+            "large_rotation=True; leave out one of the two"
+        )
 
 
 def _check_materials(scene: Scene) -> None:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
-from jaxcontact.schemes.terms import impact_loss, velocity_bound
+from jaxcontact.schemes.terms import elastic_force, impact_loss, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -42,7 +42,7 @@ class BackwardEuler:
         matrix = system.mass + dt**2 * system.stiffness
         if system.viscosity is not None:
             matrix = matrix + dt * system.viscosity
-        return SchemeMatrices(system.mass, (matrix,))
+        return SchemeMatrices(system.mass, (matrix,), spans=(1.0,))
 
     def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
@@ -54,7 +54,7 @@ class BackwardEuler:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
         w, solution = operators.problem.solve(
-            operators.mass @ v - dt * (system.stiffness @ y - load),
+            operators.mass @ v - dt * (elastic_force(system, state) - load),
             velocity_bound(system, dt, y, v),
             state.guesses[0],
         )
@@ -69,7 +69,7 @@ class BackwardEuler:
         self, system: System, operators: Operators, dt: Array, old: StepState, new: StepState
     ) -> Losses:
         """Return lam.N(y' - y)/tau and 1/2 |v' - v|_M^2 + 1/2 |y' - y|_A^2."""
-        increment = new.displacement - old.displacement
+        increment = new.deformation - old.deformation
         jump = new.velocity - old.velocity
         damping = jnp.dot(jump, operators.mass @ jump)
         damping = damping + jnp.dot(increment, system.stiffness @ increment)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from jax import Array
 
 from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
-from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
+from jaxcontact.schemes.terms import elastic_force, impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -38,7 +38,7 @@ class ContactImplicit:
 
     def matrices(self, system: System, dt: Array) -> SchemeMatrices:
         """Return M and D."""
-        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt),))
+        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt),), spans=(0.5,))
 
     def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
@@ -50,7 +50,7 @@ class ContactImplicit:
         """Advance by one step under the constant load (n,) [N]."""
         y, v = state.displacement, state.velocity
         w, solution = operators.problem.solve(
-            operators.mass @ v - 0.5 * dt * (system.stiffness @ y - load),
+            operators.mass @ v - 0.5 * dt * (elastic_force(system, state) - load),
             velocity_bound(system, dt, y, v),
             state.guesses[0],
         )

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.schemes.interface import Losses, Operators, SchemeMatrices, StepResult, StepState
-from jaxcontact.schemes.terms import impact_loss, trapezoidal_matrix, velocity_bound
+from jaxcontact.schemes.terms import elastic_force, impact_loss, trapezoidal_matrix, velocity_bound
 from jaxcontact.system.system import System
 
 
@@ -43,7 +43,8 @@ class ContactStabilized:
 
     def matrices(self, system: System, dt: Array) -> SchemeMatrices:
         """Return M, and D and M for the contact problems of the step and of its predictor."""
-        return SchemeMatrices(system.mass, (trapezoidal_matrix(system, dt), system.mass.expand()))
+        matrices = (trapezoidal_matrix(system, dt), system.mass.expand())
+        return SchemeMatrices(system.mass, matrices, spans=(0.5, 0.0))
 
     def first_carry(self, system: System) -> tuple[()]:
         """Return (): displacement and velocity are all a step needs."""
@@ -58,7 +59,7 @@ class ContactStabilized:
         guess, first_guess = state.guesses
         bound = velocity_bound(system, dt, y, v)
         u, predicted = predictor.solve(operators.mass @ v, bound, first_guess)
-        rhs = operators.mass @ u - 0.5 * dt * (system.stiffness @ y - load)
+        rhs = operators.mass @ u - 0.5 * dt * (elastic_force(system, state) - load)
         w, solution = problem.solve(rhs, bound, guess)
         change = w - u
         if problem.contact_solver.is_exact:

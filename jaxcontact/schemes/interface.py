@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.contact import ContactProblem, Guess, Solution
+from jaxcontact.system.frames import FrameState, initial_frames
 from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
@@ -27,6 +28,10 @@ class SchemeMatrices(NamedTuple):
     """The SPD matrix of each contact problem of a step, (n, n). The first one is that whose
     solution is the contact at the end of the step."""
 
+    spans: tuple[float, ...] | None = None
+    """h / tau of each matrix M + h B + h^2 A; None if they are of another form, with which bodies
+    cannot turn."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -38,6 +43,9 @@ class Operators:
 
     problems: tuple[ContactProblem, ...]
     """The contact problems of a step, P of them, each with its matrix factorised."""
+
+    spans: tuple[float, ...] | None = field(default=None, metadata={"static": True})
+    """See `SchemeMatrices`."""
 
     @property
     def problem(self) -> ContactProblem:
@@ -68,6 +76,14 @@ class StepState(NamedTuple):
     carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
 
+    frames: FrameState | None = None
+    """The frames of bodies that turn; None without them."""
+
+    @property
+    def deformation(self) -> Array:
+        """What the elastic energy is of, (n,) [m]: u in the frames, else y."""
+        return self.displacement if self.frames is None else self.frames.deformation
+
 
 class StepResult(NamedTuple):
     """What a step makes of a state."""
@@ -87,10 +103,15 @@ class StepResult(NamedTuple):
     carry: PyTree = ()
     """What else the scheme hands on, see `Scheme.first_carry`."""
 
+    frames: FrameState | None = None
+    """The frames of bodies that turn; None without them."""
+
     def state(self) -> StepState:
         """Return what the next step starts from."""
         guesses = tuple(solution.guess for solution in self.solutions)
-        return StepState(self.displacement, self.velocity, self.impulse, guesses, self.carry)
+        return StepState(
+            self.displacement, self.velocity, self.impulse, guesses, self.carry, self.frames
+        )
 
 
 class Losses(NamedTuple):
@@ -159,10 +180,17 @@ def first_state(
 
     Rollers take from it what they do not allow.
     """
+    guesses = tuple(problem.form.first_guess() for problem in operators.problems)
+    frames = None
+    if system.frames is not None:
+        frames = initial_frames(system.frames, displacement)
+        # What a contact solver keeps is of a compliance, which turns from step to step.
+        guesses = tuple(Guess(guess.active) for guess in guesses)
     return StepState(
         displacement=hold(system.rollers, displacement),
         velocity=hold(system.rollers, velocity),
         impulse=jnp.zeros(system.normals.count, system.dtype),
-        guesses=tuple(problem.form.first_guess() for problem in operators.problems),
+        guesses=guesses,
         carry=scheme.first_carry(system),
+        frames=frames,
     )

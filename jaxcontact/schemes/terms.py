@@ -60,10 +60,14 @@ def gap_resolution(pairs: Pairs, y: Array) -> Array:
 
 def _gap_resolution(pairs: Pairs, y: Array, largest: Array) -> Array:
     """Return the resolution for terms of the free motion as large as a displacement, (C,)."""
-    weights = jnp.abs(pairs.normals.weights)
-    size = jnp.sum(weights * (jnp.abs(pairs.normals.touched(y)) + largest), axis=1)
+    size = pairs.normals.absolute() @ (jnp.abs(y) + largest)
     rounding = pairs.gap_rounding + 4.0 * jnp.finfo(y.dtype).eps * size
     return jax.lax.stop_gradient(rounding)
+
+
+def elastic_force(system: System, state: StepState) -> Array | float:
+    """Return A y, (n,) [N]; zero with frames, whose contact problem holds the force, MATH.md 12."""
+    return system.stiffness @ state.displacement if state.frames is None else 0.0
 
 
 def viscous_loss(system: System, dt: Array, increment: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -31,6 +32,10 @@ class Basis:
     modes: int = field(metadata={"static": True})
     """Number of vibrations, or of what took their place."""
 
+    mark: str = field(metadata={"static": True})
+    """Fingerprint of V, see `mark_of`: whether unknowns of two models mean the same field. Models
+    that are stacked for vmap are of one mark: replace it in all of them by the same word."""
+
     def restrict(self, free: Array) -> Array:
         """Return V^T M y, the M-orthogonal projection (..., n) of free components (..., n_full)."""
         columns = free.reshape(-1, free.shape[-1]).T
@@ -40,3 +45,8 @@ class Basis:
     def with_pairs(self, kept: np.ndarray) -> Basis:
         """Return the space with some of the contact pairs, their numbers (P,) int."""
         return replace(self, normals=self.normals.rows(kept), pairs=self.pairs[kept])
+
+
+def mark_of(vectors: np.ndarray) -> str:
+    """Return the fingerprint of a concrete V."""
+    return hashlib.blake2b(vectors.tobytes(), digest_size=8).hexdigest()

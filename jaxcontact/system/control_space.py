@@ -30,7 +30,7 @@ MASS_TOLERANCE = {"float64": 1e-14, "float32": 1e-6}
 def control_loads(system: System, control: Array) -> Array:
     """Return the loads (T, n) [N] of a control (T, N, d) or (T, n) [N/m^d]."""
     if control.ndim == 2:
-        return (system.l2_mass @ control.T).T
+        return jax.vmap(system.l2_mass.__matmul__)(control)
     if system.basis is None:
         columns = jnp.moveaxis(control, 0, -1)  # (N, d, T)
         force = system.nodal_mass @ columns.reshape(system.n_nodes, -1)

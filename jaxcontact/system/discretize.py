@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,7 @@ from jaxcontact.scene.scene import (
 from jaxcontact.system import assembly
 from jaxcontact.system.contact_pairs import contact_pairs
 from jaxcontact.system.parts import named_parts
+from jaxcontact.system.placing import frames_of
 from jaxcontact.system.rollers import check_movable, hold_rows, roller_rows
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
@@ -89,7 +92,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     def on_free(values: Array) -> SymmetricMatrix:
         return SymmetricMatrix(values, pattern.columns)
 
-    return System(
+    system = System(
         mass=ComponentwiseMatrix(on_free(values.mass), dimension),
         stiffness=on_free(values.stiffness),
         viscosity=None if values.viscosity is None else on_free(values.viscosity),
@@ -109,6 +112,9 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         dimension=dimension,
         rollers=rollers,
     )
+    if not scene.large_rotation or dimension == 1:
+        return system
+    return replace(system, frames=frames_of(scene, system, pairs))
 
 
 def _check_dtype(dtype) -> None:

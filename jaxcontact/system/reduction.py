@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxcontact.system.basis import Basis
+from jaxcontact.system.basis import Basis, mark_of
 from jaxcontact.system.pair_set import pair_numbers
 from jaxcontact.system.reduced_space import HostSystem, Target, space
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
@@ -76,11 +76,17 @@ def reduce(
         controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced, reduced already or has rollers, not exactly one of
-            modes, frequency and tolerance is given, or an argument is out of its range.
+        ValueError: if the system is traced, reduced already, has rollers or bodies that turn, not
+            exactly one of modes, frequency and tolerance is given, or an argument is out of its
+            range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
+    if system.frames is not None:
+        raise ValueError(
+            "modes of the reference configuration do not turn with a body; with "
+            "large_rotation=True use the full system"
+        )
     if system.rollers is not None:
         raise ValueError(
             "a system with rollers is not reduced; clamp the facet set, or use the full system"
@@ -116,7 +122,7 @@ def enrich(system: System, reduced: System, dt: float | None) -> System:
         ValueError: if the system is not the one that was reduced.
     """
     basis = reduced.basis
-    if basis is None or system.basis is not None or len(basis.vectors) != system.size:
+    if basis is None or system.basis is not None or not _is_projection(system, reduced, basis):
         raise ValueError(
             "hand over a full system and a model that jc.reduce made of it, got systems of "
             f"{system.size} and {reduced.size} unknowns"
@@ -134,6 +140,19 @@ def enrich(system: System, reduced: System, dt: float | None) -> System:
     # The gap may be another one than it was.
     part = dataclasses.replace(part, gap=reduced.gap, gap_rounding=reduced.gap_rounding)
     return _project(part, V, basis.pairs, modes)
+
+
+def _is_projection(system: System, reduced: System, basis: Basis) -> bool:
+    """Return whether mass and stiffness of a reduced model are those of the full one on V."""
+    V = np.asarray(basis.vectors, float)
+    if len(V) != system.size:
+        return False
+    tolerance = np.sqrt(jnp.finfo(reduced.dtype).eps)
+    for matrix, expected in ((system.mass, reduced.mass), (system.stiffness, reduced.stiffness)):
+        found, expected = V.T @ (matrix.to_scipy() @ V), expected.to_scipy().toarray()
+        if not np.allclose(found, expected, rtol=0, atol=tolerance * np.max(np.abs(expected))):
+            return False
+    return True
 
 
 def _loads(system: System, patterns: Sequence[ArrayLike]) -> np.ndarray:
@@ -176,19 +195,31 @@ def _project(system: System, V: np.ndarray, pairs: np.ndarray, modes: int) -> Sy
         reduced = V.T @ (matrix.to_scipy().astype(float) @ V)
         return SymmetricMatrix(jnp.asarray(0.5 * (reduced + reduced.T), dtype), None)
 
+    def identity(factor: float) -> ComponentwiseMatrix:
+        return ComponentwiseMatrix(SymmetricMatrix(jnp.full((1, 1), factor, dtype), None), n)
+
+    l2_mass = project(system.l2_mass)
+    # With one density L is a multiple of M: no product with a matrix is needed.
+    factor = float(np.mean(l2_mass.diagonal()))
+    if np.allclose(
+        l2_mass.values, factor * np.eye(n), rtol=0, atol=64 * jnp.finfo(dtype).eps * factor
+    ):
+        l2_mass = identity(factor)
+
     def dense(normals: ContactNormals) -> ContactNormals:
         return ContactNormals(jnp.asarray(normals.to_scipy() @ V, dtype), None, n)
 
-    beside = system.open_pairs
+    beside, vectors = system.open_pairs, jnp.asarray(V, dtype)
+    mark = mark_of(np.asarray(vectors))
     return dataclasses.replace(
         system,
-        mass=ComponentwiseMatrix(SymmetricMatrix(jnp.ones((1, 1), dtype), None), n),
+        mass=identity(1.0),
         stiffness=project(system.stiffness),
         viscosity=None if system.viscosity is None else project(system.viscosity),
-        l2_mass=project(system.l2_mass),
+        l2_mass=l2_mass,
         normals=dense(system.normals),
         load=jnp.asarray(np.asarray(system.load, float) @ V, dtype),
-        basis=Basis(jnp.asarray(V, dtype), system.mass, system.normals, pairs, modes),
+        basis=Basis(vectors, system.mass, system.normals, pairs, modes, mark),
         open_pairs=None
         if beside is None
         else dataclasses.replace(beside, normals=dense(beside.normals)),

@@ -188,6 +188,10 @@ class ContactNormals:
         """Return the entries of y (n,) that each row reads, (C, k); dense (1, n), all of them."""
         return y[None, :] if self.unknowns is None else y[self.unknowns]
 
+    def absolute(self) -> ContactNormals:
+        """Return the operator with the absolute values of its entries."""
+        return ContactNormals(jnp.abs(self.weights), self.unknowns, self.size)
+
     def rows(self, pairs: np.ndarray) -> ContactNormals:
         """Return the operator of some of the pairs, their numbers (P,) int."""
         unknowns = None if self.unknowns is None else take_rows(self.unknowns, pairs)

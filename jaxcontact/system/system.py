@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from jaxcontact.system.basis import Basis
 from jaxcontact.system.control_space import control_loads, solve_mass
+from jaxcontact.system.frames import Frames
 from jaxcontact.system.lift import Lift
 from jaxcontact.system.pair_set import PairSet, pair_numbers
 from jaxcontact.system.parts import Parts
@@ -95,6 +96,9 @@ class System:
     open_pairs: PairSet | None = None
     """Pairs that are taken to stay open (see `with_pairs`); None is none."""
 
+    frames: Frames | None = None
+    """The frames of the bodies that turn (see `Scene.large_rotation`); None is none."""
+
     def _facts(self) -> dict[str, object]:
         return {
             "dimension": self.dimension,
@@ -112,6 +116,11 @@ class System:
     def size(self) -> int:
         """Number of unknowns, n."""
         return self.load.shape[-1]
+
+    @property
+    def mark(self) -> str:
+        """What the unknowns stand for: the fingerprint of the basis, empty for a full model."""
+        return "" if self.basis is None else self.basis.mark
 
     @property
     def n_nodes(self) -> int:
@@ -152,9 +161,11 @@ class System:
         If the writing fails or is killed, a file that was there before is still there.
 
         Raises:
-            ValueError: if the system is traced.
+            ValueError: if the system is traced, or bodies turn.
             OSError: if the file cannot be written.
         """
+        if self.frames is not None:
+            raise ValueError("a system with large_rotation=True holds obstacles; save its scene")
         save_dataclass(path, self)
 
     def with_pairs(self, pairs: ArrayLike) -> System:
@@ -169,8 +180,13 @@ class System:
                 `jnp.any(trajectory.active, axis=0)`, or their numbers; concrete.
 
         Raises:
-            ValueError: if the pairs are traced or are not among those of the system.
+            ValueError: if the pairs are traced or are not among those of the system, or bodies
+                turn.
         """
+        if self.frames is not None:
+            raise ValueError(
+                "with large_rotation=True any pair may come within reach; keep all of them"
+            )
         kept = pair_numbers(pairs, self.normals.count)
         rest = np.setdiff1d(np.arange(self.normals.count), kept)
         return replace(

@@ -1,5 +1,6 @@
 """Claims about the error of a reduced model: what it is estimated to be, it is, within a factor."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax.numpy as jnp
@@ -58,6 +59,7 @@ def test_reduction_error_of_a_number_is_its_difference(problem, reduced):
 
 
 def test_reduction_error_refuses_another_system(problem, reduced):
-    other = jc.discretize(jc.scenes.half_disc(h=5.0))
-    with pytest.raises(ValueError, match=r"a model that jc\.reduce made of it"):
-        jc.reduction_error(other, reduced, partial(jc.simulate, steps=2))
+    softer = replace(problem.scene, material=replace(problem.scene.material, young=1e6))
+    for scene in (jc.scenes.half_disc(h=5.0), softer):
+        with pytest.raises(ValueError, match=r"a model that jc\.reduce made of it"):
+            jc.reduction_error(jc.discretize(scene), reduced, partial(jc.simulate, steps=2))

@@ -1,6 +1,7 @@
 """Claims about controls and costs in unknowns: the same numbers without an array of the mesh."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -171,3 +172,72 @@ def test_cost_sees_supports_that_move(problem):
     motion = jc.simulate(problem.stepper, schedule=jc.Schedule(motion={"clamped": down}))
     found = tracking(problem, problem.reduced)(motion)
     agree(found, tracking(problem, system)(motion))
+
+
+@pytest.fixture(scope="module")
+def another(problem):
+    """A reduced model of the same size, on other vectors"""
+    sideways = jnp.ones_like(problem.full.reference[0]) * jnp.array([[1.0, 0.0]])
+    reduced = jc.reduce(problem.full.system, 6, loads=[sideways])
+    assert reduced.size == problem.reduced.size
+    return reduced
+
+
+def test_cost_does_not_take_the_unknowns_of_another_model_for_its_own(problem, another):
+    motion = jc.simulate(problem.stepper, SCALE * problem.control)
+    cost = tracking(problem, another)
+    agree(cost(motion), tracking(problem, problem.full.system)(motion))
+    with pytest.raises(ValueError, match="the motion is one of another model"):
+        cost(motion, problem.control)
+    with pytest.raises(ValueError, match="the stepper that made it"):
+        jc.energy(jc.prepare(another, problem.full.dt), motion)
+
+
+def test_equal_reduced_models_share_costs_and_programs(problem, tmp_path):
+    again = jc.reduce(problem.full.system, 6, loads=[problem.full.reference[0]])
+    problem.reduced.save(tmp_path / "reduced.npz")
+    loaded = jc.load_system(tmp_path / "reduced.npz")
+
+    @jax.jit
+    def value(stepper, cost, c):
+        return cost(jc.simulate(stepper, SCALE * c), c)
+
+    costs = [tracking(problem, system) for system in (problem.reduced, again, loaded)]
+    steppers = [jc.prepare(system, problem.full.dt) for system in (problem.reduced, again, loaded)]
+    values = [
+        value(stepper, cost, problem.control)
+        for stepper, cost in zip(steppers, reversed(costs), strict=True)
+    ]
+    agree(values[1:], values[:1] * 2)
+    assert value._cache_size() == 1
+
+
+def test_models_of_one_mark_are_stacked(problem, another):
+    models = [
+        replace(system, basis=replace(system.basis, mark="of two loads"))
+        for system in (problem.reduced, another)
+    ]
+    steppers = [jc.prepare(system, problem.full.dt) for system in models]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *steppers)
+    found = jax.vmap(lambda x: jc.simulate(x, SCALE * problem.nodal).displacement)(stacked)
+    for stepper, motion in zip(steppers, found, strict=True):
+        agree(motion, jc.simulate(stepper, SCALE * problem.nodal).displacement)
+
+
+@pytest.mark.parametrize("is_uniform", [True, False])
+def test_inner_product_needs_no_matrix_where_the_density_is_one_number(problem, is_uniform):
+    scene = problem.full.scene
+    heavier = scene.material.density * np.linspace(1.0, 2.0, len(scene.mesh.cells))
+    if not is_uniform:
+        scene = replace(scene, material=replace(scene.material, density=heavier))
+    reduced = jc.reduce(jc.discretize(scene), 6)
+    assert (sum(x.size for x in jax.tree.leaves(reduced.l2_mass)) == 1) == is_uniform
+    c = jnp.cos(jnp.arange(2.0 * reduced.size)).reshape(2, -1)
+    agree(jc.control_dot(reduced, 1.0, c, c), jc.control_dot(reduced, 1.0, *[reduced.lift(c)] * 2))
+    levels = problem.full.target[:2]
+    motion = jc.simulate(jc.prepare(reduced, problem.full.dt), SCALE * c[:1])
+    costs = [
+        jc.TrackingCost(system, target=levels, control_weight=1e9)(motion, control)
+        for system, control in ((reduced, c[:1]), (jc.discretize(scene), reduced.lift(c[:1])))
+    ]
+    agree(*costs)

@@ -75,6 +75,7 @@ def eliminated(system, Q):
             system.normals,
             np.arange(system.normals.count),
             modes=0,
+            mark="eliminated",
         ),
     )
 

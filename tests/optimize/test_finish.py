@@ -56,6 +56,25 @@ def test_finish_is_strongly_stationary_with_weak_contact(result):
     assert "0 with a wrong sign" in str(certificate)
 
 
+def test_finish_with_bounds_is_strongly_stationary(disc, result):
+    # Half of the largest force: most of the control is at a bound.
+    largest = 0.5 * float(jnp.max(jnp.abs(result.control)))
+    bounded = jc.optimize(
+        disc.objective,
+        jnp.zeros_like(disc.reference),
+        method=jc.Homotopy(),
+        bounds=(-largest, largest),
+        system=disc.system,
+        dt=disc.dt,
+    )
+    assert bounded.status is jc.Ending.CERTIFIED
+    assert float(jnp.max(jnp.abs(bounded.control))) == largest
+    assert 10 < np.sum(np.abs(np.asarray(bounded.control)) == largest)
+    certificate = bounded.stationarity
+    assert certificate.is_strong
+    assert certificate.residual < EXACT * result.history.gradient_norm[0]
+
+
 def test_certified_control_is_a_local_minimiser_with_growth(disc, result):
     # Strong stationarity on convex quadratic pieces: J(u + d) - J(u) >= alpha/2 |d|^2.
     value = jax.jit(disc.objective)

@@ -83,9 +83,22 @@ def test_homotopy_within_bounds_ends_at_the_bounded_minimiser():
     result = run(problem, jc.Homotopy(), bounds=(-jnp.inf, upper))
     assert bool(jnp.all(result.control <= upper))
     final = problem.simulate(result.control)
-    np.testing.assert_allclose(final.gap[-1], 0.0, atol=1e-6)
-    np.testing.assert_allclose(result.control[0, 1, 0], upper[0, 1, 0])
-    assert result.stationarity.residual < 1e-6 * result.history.gradient_norm[0]
+    np.testing.assert_allclose(final.gap[-1], 0.0, atol=1e-12)
+    assert result.control[0, 1, 0] == upper[0, 1, 0]
+    assert result.status is jc.Ending.CERTIFIED
+    assert result.stationarity.residual < 1e-11 * result.history.gradient_norm[0]
+
+
+def test_homotopy_within_bounds_continues_from_a_file(tmp_path):
+    problem = grazing()
+    bounds = (-jnp.inf, 0.5 * minimizer(problem)[0, 1, 0])
+    whole = run(problem, jc.Homotopy(levels=4), bounds=bounds)
+    run(problem, jc.Homotopy(levels=4), bounds=bounds, iterations=2).save(tmp_path / "half.npz")
+    half = jc.load_result(tmp_path / "half.npz")
+    rest = jc.optimize(
+        problem.objective, half, method=jc.Homotopy(levels=4), bounds=bounds, **problem.options
+    )
+    np.testing.assert_array_equal(rest.control, whole.control)
 
 
 def test_homotopy_over_an_actuator_finds_the_best_admissible_push():
@@ -142,6 +155,27 @@ def test_homotopy_is_certified_on_every_mesh(rings, gradients, products):
     assert certificate.is_strong
     assert history.evaluations[-1] <= gradients
     assert history.hessian_products[-1] <= products
+
+
+@pytest.mark.slow
+def test_homotopy_within_bounds_is_certified_for_the_papers_problem():
+    problem = jc.scenes.half_disc_control()
+    result = jc.optimize(
+        problem.objective,
+        jnp.zeros_like(problem.reference),
+        method=jc.Homotopy(),
+        bounds=(-0.5, 0.5),
+        system=problem.system,
+        dt=problem.dt,
+    )
+    history, certificate = result.history, result.stationarity
+    assert result.status is jc.Ending.CERTIFIED
+    assert certificate.residual <= 1e-10 * history.gradient_norm[0]
+    assert certificate.is_strong
+    # Most of the control is at a bound.
+    assert np.mean(np.abs(np.asarray(result.control)) == 0.5) > 0.6
+    assert history.evaluations[-1] <= 60
+    assert history.hessian_products[-1] <= 500
 
 
 @pytest.mark.slow
