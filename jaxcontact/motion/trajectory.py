@@ -1,4 +1,4 @@
-"""What a simulation returns, and what it may start from.
+"""What a simulation returns.
 
 A motion is recorded in its unknowns, and nodal fields are lifted from them when they are asked for.
 """
