@@ -23,7 +23,6 @@ def load_trajectory(path: str | Path) -> Trajectory:
         ValueError: if the file is damaged or holds something else.
         RuntimeError: if it is in float64 while JAX has it switched off.
     """
-    saved = load_dataclass(
-        path, (Trajectory, ContactRecord, Schedule, StoredFields, Lift, FrameMotion)
-    )
+    kinds = (Trajectory, ContactRecord, Schedule, FrameMotion, StoredFields, Lift)
+    saved = load_dataclass(path, kinds)
     return replace(saved, nodal=NodalFields.from_stored(saved.nodal))

@@ -73,7 +73,8 @@ def momentum(stepper: Stepper, trajectory: Trajectory, control: Array | None = N
     if trajectory.schedule is not None:
         raise ValueError("the momentum ledger does not know the loads of a schedule")
     if control is not None:
-        check_control(stepper.system, control)
+        system = stepper.system
+        check_control(control, system.points.shape, system.size, len(trajectory.contact_impulse))
     multiplier = trajectory.contact.multiplier
     predictor = multiplier[:, 1] if multiplier.shape[1] > 1 else jnp.zeros_like(multiplier[:, 0])
     records = (trajectory.unknowns, trajectory.rates, trajectory.contact_impulse, predictor)

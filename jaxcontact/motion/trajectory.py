@@ -96,26 +96,6 @@ class Trajectory:
     mark: str = field(default="", metadata={"static": True})
     """What the unknowns stand for, `System.mark`."""
 
-    def _facts(self) -> dict[str, object]:
-        if is_traced(self):
-            return {"steps": self.contact_impulse.shape[-2], "values": "traced"}
-        status, counts = np.unique(np.asarray(self.status), return_counts=True)
-        total = np.asarray(self.contact_force).sum(axis=-1)
-        return {
-            "steps": total.shape[-1],
-            "batch": "x".join(map(str, total.shape[:-1])),
-            "end": f"{np.max(np.asarray(self.time)):.4g} s",
-            "unknowns": self.unknowns.shape[-1],
-            "contact_pairs": self.gap.shape[-1],
-            "status": {
-                Status(int(kind)).name.lower(): int(count)
-                for kind, count in zip(status, counts, strict=True)
-            },
-            "largest_force": f"{np.max(total, initial=0.0):.4g} N",
-        }
-
-    __repr__, _repr_html_ = shown_by(_facts)
-
     @property
     def rotation(self) -> Array:
         """Rotation of each body with a frame, (T+1, F, d, d).
@@ -139,6 +119,26 @@ class Trajectory:
         if self.frames is None:
             raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
         return self.frames
+
+    def _facts(self) -> dict[str, object]:
+        if is_traced(self):
+            return {"steps": self.contact_impulse.shape[-2], "values": "traced"}
+        status, counts = np.unique(np.asarray(self.status), return_counts=True)
+        total = np.asarray(self.contact_force).sum(axis=-1)
+        return {
+            "steps": total.shape[-1],
+            "batch": "x".join(map(str, total.shape[:-1])),
+            "end": f"{np.max(np.asarray(self.time)):.4g} s",
+            "unknowns": self.unknowns.shape[-1],
+            "contact_pairs": self.gap.shape[-1],
+            "status": {
+                Status(int(kind)).name.lower(): int(count)
+                for kind, count in zip(status, counts, strict=True)
+            },
+            "largest_force": f"{np.max(total, initial=0.0):.4g} N",
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
     @property
     def unknowns(self) -> Array:
