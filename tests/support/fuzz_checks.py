@@ -217,7 +217,8 @@ def _judge_difference(batch, report, sign, is_solved, worst):
     is_clear = noise < 0.01 * size
     report.counts["kinked"] += int(np.sum(is_solved & ~is_smooth))
     report.counts["unclear"] += int(np.sum(is_solved & is_smooth & ~is_clear))
-    report.require(batch, "difference", np.abs(difference - expected), DIFFERENCE * size + bend + noise,
+    allowed = DIFFERENCE * size + bend + noise
+    report.require(batch, "difference", np.abs(difference - expected), allowed,
                    is_solved & is_smooth & is_clear)  # fmt: skip
 
 
