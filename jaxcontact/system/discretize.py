@@ -50,7 +50,7 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
         >>> system = jc.discretize(jc.scenes.bar_on_wall())
         >>> system.size, system.gap
         (21, Array([0.01], dtype=float64))
-        >>> float(system.mass.to_scipy().sum())  # density times length
+        >>> print(f"{system.mass.to_scipy().sum():.4f}")  # density times length
         0.0073
     """
     dtype = jnp.dtype(dtype)
