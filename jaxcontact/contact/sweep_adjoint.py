@@ -28,6 +28,7 @@ from jaxcontact.contact.sweeps import (
     make_sweep,
     middle_frame,
     run_sweeps,
+    start_of,
 )
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.tangents import instantiate
@@ -89,7 +90,9 @@ def _solve_bwd(residuals, cotangents):
         values = iter(chosen)
         parts = [next(values) if yes else x for x, yes in zip(leaves, is_asked, strict=True)]
         equation = jax.tree.unflatten(tree, parts)
-        after, solution, _ = make_sweep(equation, fixed, form, frame, unknowns, guess)
+        after, solution, _ = make_sweep(
+            equation, start_of(equation), fixed, form, frame, unknowns, guess
+        )
         return after, solution.multiplier
 
     _, back = jax.vjp(sweep, unknowns, chosen)

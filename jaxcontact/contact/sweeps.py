@@ -27,7 +27,7 @@ from jaxcontact.contact.condensed import CondensedContact
 from jaxcontact.contact.form import ContactForm
 from jaxcontact.contact.vi import NO_PERTURBATION, Bound, ContactProblem, Perturbation
 from jaxcontact.linear.turned import TurnedFactor, turned_factor
-from jaxcontact.system.frames import Frames, FrameState, turn, turned_force, turned_places
+from jaxcontact.system.frames import Frames, FrameStart, FrameState, frame_start, turn, turned_force
 from jaxcontact.system.small_matrices import cayley, product
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
@@ -64,6 +64,12 @@ class Equation(NamedTuple):
 
     bound: Array
     """b, (C,)."""
+
+    places: Array
+    """Places of the contact nodes at the start of the step, (C, d) [m]."""
+
+    more: Array
+    """What b is larger by than the distance over tau, (C,) [m/s]."""
 
     span: Array
     """h, scalar [s]."""
@@ -104,8 +110,25 @@ class Unknowns(NamedTuple):
     """Axial vector of W, (F, s)."""
 
 
+class Start(NamedTuple):
+    """What all sweeps over a step share."""
+
+    frames: FrameStart
+    """The frames at the start of the step."""
+
+    force: Array
+    """h A u, (n,)."""
+
+
+def start_of(equation: Equation) -> Start:
+    """Return what all sweeps over a step share."""
+    force = equation.span * (equation.stiffness @ equation.state.deformation)
+    return Start(frame_start(equation.frames, equation.state), force)
+
+
 def make_sweep(
     equation: Equation,
+    start: Start,
     fixed: Fixed,
     form: ContactForm,
     frame: Array,
@@ -113,19 +136,23 @@ def make_sweep(
     guess: Guess,
 ) -> tuple[Unknowns, Solution, Array]:
     """Make one sweep (6); return the new unknowns, the solution of its VI and |x|."""
-    matrix, mass, stiffness, frames, state, weights, rhs, bound, h, dt = equation
+    matrix, mass, frames, dt = equation.matrix, equation.mass, equation.frames, equation.dt
     w, increment = unknowns
+    weights, bound = contact_at(equation, fixed, w)
     shape = frames.reference.shape
-    places = turned_places(frames, state)
-    step, increment = turn(frames, state.rotation, places, dt, w.reshape(shape), increment)
+    step, increment = turn(frames, start.frames, dt, w.reshape(shape), increment)
     # Both products with M at once, and h a = h A u + D e - M e.
     e = step.rate.reshape(-1)
     products = mass @ jnp.stack([w, e], axis=1)
-    force = h * (stiffness @ state.deformation) + matrix @ e - products[:, 1]
+    force = start.force + matrix @ e - products[:, 1]
     g = turned_force(frames, step, force.reshape(shape))
-    rest = (rhs - products[:, 0]).reshape(shape) - g
+    rest = (equation.rhs - products[:, 0]).reshape(shape) - g
     rest = frames.apply(jnp.swapaxes(frame, 1, 2), rest, 1.0).reshape(-1)
-    turned = ContactNormals(_turned_rows(frames, weights, frame, fixed), fixed.unknowns, w.size)
+    rows = _turned_rows(frames, weights, frame, fixed)
+    if frames.is_concave:
+        form = turned_form(form, jax.lax.stop_gradient(rows))
+        guess = form.first_guess()._replace(active=guess.active)
+    turned = ContactNormals(rows, fixed.unknowns, w.size)
     normals = ContactNormals(weights, fixed.unknowns, w.size)
     problem = ContactProblem(
         matrix,
@@ -140,6 +167,23 @@ def make_sweep(
     return Unknowns(w + change, increment), solution, jnp.max(jnp.abs(x))
 
 
+def contact_at(equation: Equation, fixed: Fixed, velocity: Array) -> tuple[Array, Array]:
+    """Return the rows of N (C, d) and b (C,) at a velocity w (n,).
+
+    A node that meets a concave obstacle has them at its new place, where the tangent is in front
+    of the obstacle: b = phi(x') / tau + nu' . w. All others keep them.
+    """
+    weights, bound, dt = equation.weights, equation.bound, equation.dt
+    for meeting in equation.frames.meetings:
+        if meeting.is_concave:
+            pairs = meeting.pairs
+            w = velocity[fixed.unknowns[pairs]]
+            distance, normals = meeting.measure(equation.places[pairs] + dt * w)
+            reached = distance / dt + jnp.sum(normals * w, axis=1) + equation.more[pairs]
+            weights, bound = weights.at[pairs].set(normals), bound.at[pairs].set(reached)
+    return weights, bound
+
+
 def _turned_rows(frames: Frames, weights: Array, frame: Array, fixed: Fixed) -> Array:
     """Return the rows of N Rm, (C, d)."""
     d = weights.shape[1]
@@ -147,7 +191,8 @@ def _turned_rows(frames: Frames, weights: Array, frame: Array, fixed: Fixed) -> 
     turns = frames.spread(frame, identity)
     if frames.numbers is not None:
         turns = turns[fixed.unknowns[:, 0] // d]
-    return jnp.sum(weights[:, :, None] * turns, axis=1)
+    terms = [weights[:, i, None] * turns[:, i, :] for i in range(d)]
+    return sum(terms[1:], terms[0])
 
 
 def turned_form(form: ContactForm, rows: Array) -> ContactForm:
@@ -192,16 +237,16 @@ def run_sweeps(equation: Equation, fixed: Fixed) -> tuple[Unknowns, Solution]:
     shape = frames.reference.shape
     s = shape[1] * (shape[1] - 1) // 2
     velocity, dtype = fixed.velocity, fixed.velocity.dtype
-    places = turned_places(frames, state)
+    begin = start_of(equation)
     none = jnp.zeros((len(state.rotation), s), dtype)
     for _ in range(2):
-        _, none = turn(frames, state.rotation, places, equation.dt, velocity.reshape(shape), none)
+        _, none = turn(frames, begin.frames, equation.dt, velocity.reshape(shape), none)
     frame, form = middle_frame(equation, fixed, none)
     first = Unknowns(velocity, none)
     guess = form.first_guess()._replace(active=fixed.guess.active)
 
     def sweep(unknowns: Unknowns, guess: Guess) -> tuple[Unknowns, Solution, Array]:
-        return make_sweep(equation, fixed, form, frame, unknowns, guess)
+        return make_sweep(equation, begin, fixed, form, frame, unknowns, guess)
 
     # The rounding error of the free motion is that of h A u: for every tau some eps u / tau.
     size = jnp.max(jnp.abs(state.deformation), initial=0.0)

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxcontact.contact.complementarity import ContactSolver, Guess, Solution, Status
 from jaxcontact.contact.sweep_adjoint import solve_by_sweeps
-from jaxcontact.contact.sweeps import Equation, Fixed, turned_form
+from jaxcontact.contact.sweeps import Equation, Fixed, contact_at, turned_form
 from jaxcontact.contact.vi import Bound, ContactProblem
-from jaxcontact.system.frames import Frames, FrameState, next_frames, turn, turned_places
+from jaxcontact.linear import Factor, can_condense
+from jaxcontact.linear.turned import TurnedFactor, turned_factor
+from jaxcontact.system.frames import Frames, FrameState, frame_start, next_frames, turn
 from jaxcontact.system.sparse import ComponentwiseMatrix, ContactNormals, SymmetricMatrix
 
 
@@ -39,6 +42,12 @@ class TurningProblem:
     velocity: Array
     """Where the sweeps start, (n,)."""
 
+    places: Array
+    """Places of the contact nodes at the start of the step, (C, d) [m]."""
+
+    more: Array
+    """What b is larger by than the distance over tau, (C,) [m/s]."""
+
     span: Array
     """h, scalar [s]."""
 
@@ -58,6 +67,7 @@ class TurningProblem:
         """
         shift, push, *_ = self.problem.perturbation
         value = bound.value if shift is None else bound.value + shift
+        more = self.more if shift is None else self.more + shift
         normals = self.problem.normals
         assert normals.unknowns is not None
         if push is not None:
@@ -71,6 +81,8 @@ class TurningProblem:
             normals.weights,
             rhs,
             value,
+            self.places,
+            more,
             self.span,
             self.dt,
         )
@@ -85,19 +97,14 @@ class TurningProblem:
         unknowns, solution = solve_by_sweeps(equation, jax.lax.stop_gradient(fixed))
         poison = jnp.where(solution.status <= Status.FALLBACK, 1.0, jnp.nan).astype(rhs.dtype)
         w = unknowns.velocity * poison
-        places = turned_places(self.frames, self.state)
-        step, increment = turn(
-            self.frames,
-            self.state.rotation,
-            places,
-            self.dt,
-            w.reshape(places.shape),
-            unknowns.increment,
-        )
+        start = frame_start(self.frames, self.state)
+        nodal = w.reshape(start.places.shape)
+        step, increment = turn(self.frames, start, self.dt, nodal, unknowns.increment)
+        weights, value = contact_at(equation, fixed, w)
         multiplier = solution.multiplier if push is None else solution.multiplier + push
         return w, solution._replace(
             multiplier=multiplier * poison,
-            separation=value - normals @ w,
+            separation=value - ContactNormals(weights, normals.unknowns) @ w,
             frames=next_frames(self.frames, self.state, self.dt, step, increment),
         )
 
@@ -109,6 +116,23 @@ def check_turning(contact_solver: ContactSolver) -> None:
             f"{contact_solver} is a law of the compliance of its pairs, which turns with the body; "
             "with large_rotation=True use jc.SemismoothNewton()"
         )
+
+
+def turning_factor(
+    factor: Factor, contact_solver: ContactSolver, weights: Array, places: np.ndarray | None
+) -> TurnedFactor:
+    """Return the factor for contact rows (C, d) that turn; see `turned_factor`.
+
+    Raises:
+        ValueError: if the solvers do not know contact rows that turn.
+    """
+    if not can_condense(factor):
+        raise ValueError(
+            "conjugate gradients do not know normals that turn; with large_rotation=True prepare "
+            "with linear_solver=jc.NestedDissection()"
+        )
+    check_turning(contact_solver)
+    return turned_factor(factor, weights, places)
 
 
 def turned_problem(problem: ContactProblem, normals: ContactNormals) -> ContactProblem:

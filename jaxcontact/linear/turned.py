@@ -23,13 +23,14 @@ class TurnedFactor:
     """A condensing factor for C contact rows at c nodes; make it with `turned_factor`."""
 
     nodal: CondensingFactor
-    """The factor with the d components of the contact nodes as rows, one node after the other."""
+    """The factor with the components of the contact nodes as rows: the first ones of all c nodes,
+    then the next, (d c,)."""
 
     weights: Array
     """The contact rows at their nodes, (C, d)."""
 
-    places: np.ndarray
-    """Number of the node of each row, (C,) int32."""
+    places: np.ndarray | None
+    """Number of the node of each row, (C,) int32; None if they are those of the nodes."""
 
     compliance: Array
     """N D^-1 N^T, (C, C)."""
@@ -46,22 +47,33 @@ class TurnedFactor:
     def condense(self, rhs: Array) -> tuple[Partial, Array]:
         """Return what `expand` needs and N D^-1 rhs, (C,)."""
         partial, free = self.nodal.condense(rhs)
-        free = free.reshape(-1, self.weights.shape[1])[self.places]
-        return partial, jnp.sum(self.weights * free, axis=1)
+        free = free.reshape(self.weights.shape[1], -1)
+        free = free if self.places is None else free[:, self.places]
+        return partial, jnp.sum(self.weights.T * free, axis=0)
 
     def expand(self, partial: Partial, multiplier: Array) -> Array:
         """Return D^-1 (rhs - N^T multiplier), (n,)."""
-        n_nodes = self.nodal.compliance.shape[0] // self.weights.shape[1]
-        forces = jnp.zeros((n_nodes, self.weights.shape[1]), self.weights.dtype)
-        forces = forces.at[self.places].add(self.weights * multiplier[:, None])
+        forces = self.weights.T * multiplier[None, :]
+        if self.places is not None:
+            d = len(forces)
+            nodal = jnp.zeros((d, self.nodal.compliance.shape[0] // d), forces.dtype)
+            forces = nodal.at[:, self.places].add(forces)
         return self.nodal.expand(partial, forces.reshape(-1))
 
 
 @in_full_precision
-def turned_factor(nodal: CondensingFactor, weights: Array, places: np.ndarray) -> TurnedFactor:
+def turned_factor(
+    nodal: CondensingFactor, weights: Array, places: np.ndarray | None
+) -> TurnedFactor:
     """Return the factor for contact rows (C, d) at the numbered contact nodes (C,)."""
     d = weights.shape[1]
     n_nodes = nodal.compliance.shape[0] // d
-    blocks = nodal.compliance.reshape(n_nodes, d, n_nodes, d)[places]
-    rows = jnp.sum(weights[:, :, None, None] * blocks, axis=1)[:, places]
-    return TurnedFactor(nodal, weights, places, jnp.sum(rows * weights[None], axis=2))
+    blocks = nodal.compliance.reshape(d, n_nodes, d, n_nodes)
+
+    def block(i: int, j: int) -> Array:
+        whole = blocks[i, :, j]
+        own = whole if places is None else whole[places][:, places]
+        return weights[:, i, None] * own * weights[None, :, j]
+
+    terms = [block(i, j) for i in range(d) for j in range(d)]
+    return TurnedFactor(nodal, weights, places, sum(terms[1:], terms[0]))

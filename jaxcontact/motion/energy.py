@@ -10,7 +10,7 @@ add to it is in `drive.py` and `supports.py`. Source: MATH.md 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.terms import viscous_loss
 from jaxcontact.system.control_space import control_loads
-from jaxcontact.system.placing import placed
+from jaxcontact.system.placing import rows_of_step
 from jaxcontact.transforms.precision import in_full_precision
 
 
@@ -148,7 +148,8 @@ def _ledger(
             jnp.dot(new.velocity - old.velocity, operators.mass @ velocity)
             + jnp.dot(deforming, system.stiffness @ deformation)
         )
-        here = placed(system, old.displacement)
+        rows = rows_of_step(system, old.displacement, new.displacement)
+        here = replace(system, normals=replace(system.normals, weights=rows))
         losses = stepper.scheme.losses(here, operators, dt, old, new)
         numerical = jnp.asarray(losses.numerical, change.dtype)
         viscous = viscous_loss(system, dt, deforming)

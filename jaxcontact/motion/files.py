@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from jaxcontact.motion.contact_record import ContactRecord
 from jaxcontact.motion.frame_motion import FrameMotion
 from jaxcontact.motion.nodal_fields import NodalFields, StoredFields
 from jaxcontact.motion.schedule import Schedule
-from jaxcontact.motion.trajectory import ContactRecord, Trajectory
+from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.lift import Lift
 from jaxcontact.transforms.saved import load_dataclass
 

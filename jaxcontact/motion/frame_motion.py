@@ -55,6 +55,17 @@ def frame_motion(
     return FrameMotion(rotation, jax.vmap(centre)(displacement), deformation)
 
 
+def turning(frames: FrameMotion | None) -> FrameMotion:
+    """Return the frames of a motion.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if frames is None:
+        raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
+    return frames
+
+
 def check_frames(
     system: System, schedule: Schedule | None, weak_contact: WeakContact | AlongDirection | None
 ) -> None:

@@ -21,7 +21,7 @@ from jaxcontact.motion.stepper import Stepper
 from jaxcontact.motion.trajectory import Trajectory
 from jaxcontact.system.control_space import control_loads
 from jaxcontact.system.frames import Frames
-from jaxcontact.system.placing import gap_and_rows
+from jaxcontact.system.placing import gap_and_rows, rows_of_step
 from jaxcontact.system.small_matrices import axial
 from jaxcontact.system.sparse import ContactNormals
 from jaxcontact.transforms.precision import in_full_precision
@@ -111,11 +111,12 @@ def _ledger(
 
     def flow(step: tuple) -> tuple[Array, Array, Array, Array]:
         y, new, v, v_new, lam, mu, added = step
-        rows = ContactNormals(gap_and_rows(system, y)[1], system.normals.unknowns)
+        rows = ContactNormals(rows_of_step(system, y, new), system.normals.unknowns)
+        before = ContactNormals(gap_and_rows(system, y)[1], system.normals.unknowns)
         load = system.load if added is None else system.load + added
         pushed = dt * load - rows.transposed_product(lam, y.size)
         middle, increment = reference + 0.5 * (y + new), new - y
-        taken = rows.transposed_product(mu, y.size)
+        taken = before.transposed_product(mu, y.size)
         angular = moment(middle, pushed) + moment(increment, taken)
         gained = stepper.operators.mass @ (v_new - v)
         change = moment(middle, gained)

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
-from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, Solution, WeakContact
+from jaxcontact.contact import AlongDirection, ClosedBranch, CriticalCone, WeakContact
 from jaxcontact.motion.checks import check_initial, check_steps, raise_if_failed, refuse_closed
+from jaxcontact.motion.contact_record import ContactRecord, record_of, worst_of
 from jaxcontact.motion.drive import (
     StepDrive,
     apply_drive,
@@ -32,7 +33,8 @@ from jaxcontact.motion.progress import Progress
 from jaxcontact.motion.schedule import Schedule, check_schedule
 from jaxcontact.motion.stepper import Stepper, StepPerturbation
 from jaxcontact.motion.supports import Moves
-from jaxcontact.motion.trajectory import ContactRecord, State, Trajectory
+from jaxcontact.motion.trajectory import State, Trajectory
+from jaxcontact.motion.turned_bodies import warn_of_rotation
 from jaxcontact.schemes import StepState
 from jaxcontact.schemes.interface import first_state
 from jaxcontact.schemes.turning import make_step
@@ -81,6 +83,9 @@ def simulate(
 
     Returns:
         The trajectory of T steps.
+
+    Warns if the result is concrete and a body without clamped nodes has turned by more than five
+    degrees without `Scene.large_rotation`.
 
     Raises:
         ValueError: if shapes do not fit, an option is not an object of its kind, a value is not
@@ -132,6 +137,7 @@ def simulate(
     trajectory = Trajectory(**values, nodal=nodal, schedule=schedule, mark=mark)
     if not isinstance(trajectory.status, Tracer):
         raise_if_failed(trajectory)
+        warn_of_rotation(stepper.system, motion.unknowns, save_every)
     return trajectory
 
 
@@ -197,12 +203,12 @@ def _run(
             load = load + more
         perturbed = perturbation.on(operators, dt)
         result = make_step(stepper.scheme, now, perturbed, dt, state, load)
-        iterations, status, residual = _worst(result.solutions)
+        iterations, status, residual = worst_of(result.solutions)
         result, status = refuse_closed(system, result.displacement, result, status)
         return result.state(), (
             result.impulse,
             (iterations, status, residual),
-            _record(dt, result.solutions),
+            record_of(dt, result.solutions),
         )
 
     inputs = (control, stepper.perturbation, None if drive is None else every_step(drive))
@@ -231,25 +237,6 @@ def _run(
         frames=frame_motion(system, start, states, displacement),
     )
     return motion, moves
-
-
-def _record(dt: Array, solutions: tuple[Solution, ...]) -> ContactRecord:
-    """Return how the contact problems of one step ended, (P, C) each."""
-    return ContactRecord(
-        multiplier=jnp.stack([x.multiplier for x in solutions]),
-        gap=dt * jnp.stack([x.separation for x in solutions]),
-        active=jnp.stack([x.active for x in solutions]),
-        weak=jnp.stack([x.weak for x in solutions]),
-    )
-
-
-def _worst(solutions: tuple[Solution, ...]) -> tuple[Array, Array, Array]:
-    """Return most iterations, worst status and largest residual of the problems of a step."""
-    return (
-        jnp.max(jnp.stack([x.iterations for x in solutions])),
-        jnp.max(jnp.stack([x.status for x in solutions])),
-        jnp.max(jnp.stack([x.residual for x in solutions])),
-    )
 
 
 def _open_along(

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxcontact.motion.contact_record import ContactRecord
 from jaxcontact.motion.simulate import simulate
 from jaxcontact.motion.stepper import Stepper
-from jaxcontact.motion.trajectory import ContactRecord, State
+from jaxcontact.motion.trajectory import State
 
 
 @jax.tree_util.register_dataclass

@@ -18,18 +18,15 @@ from jaxcontact.contact import (
     SemismoothNewton,
     contact_problem,
 )
-from jaxcontact.contact.turning import check_turning
+from jaxcontact.contact.turning import turning_factor
 from jaxcontact.linear import (
     Factor,
     LinearSolver,
-    can_condense,
     check_memory,
     choose_linear_solver,
 )
-from jaxcontact.linear.turned import TurnedFactor, turned_factor
 from jaxcontact.schemes import ContactImplicit, Operators, Scheme
 from jaxcontact.system.courant import courant_number
-from jaxcontact.system.frames import Frames
 from jaxcontact.system.rollers import hold_matrix
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
@@ -217,33 +214,14 @@ def factorize(
     values, weights = jax.lax.stop_gradient((matrix.values, system.normals.weights))
     rows = ContactNormals(weights, system.normals.unknowns)
     if system.frames is not None:
-        rows = _nodal_rows(system.frames, system.dtype)
+        rows = system.frames.nodal_rows(system.dtype)
     factor = linear_solver.factorize(
         SymmetricMatrix(values, matrix.columns), rows, _unknown_coordinates(system)
     )
     _check_factor(factor)
     if system.frames is not None:
-        factor = _turned(factor, contact_solver, weights, system.frames)
+        factor = turning_factor(factor, contact_solver, weights, system.frames.places)
     return contact_problem(matrix, system.normals, factor, contact_solver, system.rollers)
-
-
-def _nodal_rows(frames: Frames, dtype: np.dtype) -> ContactNormals:
-    """Return the components of the contact nodes as contact rows: normals of every direction."""
-    unknowns = frames.unknowns[:, None]
-    return ContactNormals(jnp.ones(unknowns.shape, dtype), unknowns)
-
-
-def _turned(
-    factor: Factor, contact_solver: ContactSolver, weights: Array, frames: Frames
-) -> TurnedFactor:
-    """Return the factor for the contact rows (C, d) of bodies that turn."""
-    if not can_condense(factor):
-        raise ValueError(
-            "conjugate gradients do not know normals that turn; with large_rotation=True prepare "
-            "with linear_solver=jc.NestedDissection()"
-        )
-    check_turning(contact_solver)
-    return turned_factor(factor, weights, frames.places)
 
 
 def with_contact(tree: Tree, contact_solver: ContactSolver) -> Tree:

@@ -10,48 +10,15 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from jaxcontact.contact import Status
-from jaxcontact.motion.frame_motion import FrameMotion
+from jaxcontact.motion.contact_record import ContactRecord
+from jaxcontact.motion.frame_motion import FrameMotion, turning
 from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.state import State
 from jaxcontact.transforms.saved import save_dataclass
-from jaxcontact.transforms.show import shown_by
 from jaxcontact.transforms.traced import is_traced
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ContactRecord:
-    """How every contact problem of every step ended; T steps, P problems of a step, C pairs.
-
-    Problem 0 is the contact at the end of the step. `ContactStabilized` has two problems: its
-    predictor may be in weak contact while the pair is open at the end of the step.
-    """
-
-    multiplier: Array
-    """Multiplier p of the VI, (T, P, C) [N s]; lam / 2 in the contact-implicit scheme."""
-
-    gap: Array
-    """Gap that the problem leaves, (T, P, C) [m]."""
-
-    active: Array
-    """Pairs with a closed gap, (T, P, C) bool: strong and weak contact."""
-
-    weak: Array
-    """Pairs in weak contact, (T, P, C) bool: closed without a force.
-
-    Gap and force count as zero below the rounding of the problem, `complementarity.tolerance` in
-    the folder contact.
-    """
-
-    @property
-    def strong(self) -> Array:
-        """Pairs in strong contact, (T, P, C) bool: closed under a force."""
-        return self.active & ~self.weak
 
 
 @jax.tree_util.register_dataclass
@@ -98,47 +65,13 @@ class Trajectory:
 
     @property
     def rotation(self) -> Array:
-        """Rotation of each body with a frame, (T+1, F, d, d).
-
-        Raises:
-            ValueError: if no body turns.
-        """
-        return self._frames.rotation
+        """Rotation of each body that turns, (T+1, F, d, d); a ValueError if none does."""
+        return turning(self.frames).rotation
 
     @property
     def centre(self) -> Array:
-        """Mass centre of each body with a frame, (T+1, F, d) [m].
-
-        Raises:
-            ValueError: if no body turns.
-        """
-        return self._frames.centre
-
-    @property
-    def _frames(self) -> FrameMotion:
-        if self.frames is None:
-            raise ValueError("no body has a frame; discretize a scene with large_rotation=True")
-        return self.frames
-
-    def _facts(self) -> dict[str, object]:
-        if is_traced(self):
-            return {"steps": self.contact_impulse.shape[-2], "values": "traced"}
-        status, counts = np.unique(np.asarray(self.status), return_counts=True)
-        total = np.asarray(self.contact_force).sum(axis=-1)
-        return {
-            "steps": total.shape[-1],
-            "batch": "x".join(map(str, total.shape[:-1])),
-            "end": f"{np.max(np.asarray(self.time)):.4g} s",
-            "unknowns": self.unknowns.shape[-1],
-            "contact_pairs": self.gap.shape[-1],
-            "status": {
-                Status(int(kind)).name.lower(): int(count)
-                for kind, count in zip(status, counts, strict=True)
-            },
-            "largest_force": f"{np.max(total, initial=0.0):.4g} N",
-        }
-
-    __repr__, _repr_html_ = shown_by(_facts)
+        """Mass centre of each body that turns, (T+1, F, d) [m]; a ValueError if none does."""
+        return turning(self.frames).centre
 
     @property
     def unknowns(self) -> Array:

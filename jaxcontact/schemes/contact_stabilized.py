@@ -62,7 +62,9 @@ class ContactStabilized:
         rhs = operators.mass @ u - 0.5 * dt * (elastic_force(system, state) - load)
         w, solution = problem.solve(rhs, bound, guess)
         change = w - u
-        if problem.contact_solver.is_exact:
+        # Between the tangents of a bowl at two places there is more than rounding.
+        is_concave = system.frames is not None and system.frames.is_concave
+        if problem.contact_solver.is_exact and not is_concave:
             held = (solution.multiplier > 0.0) & (predicted.multiplier > 0.0)
             change = change - _rounding(system, change, held)
         velocity, impulse = v + 2.0 * change, 2.0 * solution.multiplier

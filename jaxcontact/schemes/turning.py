@@ -30,7 +30,9 @@ def make_step(
     here, turning, spans = placed(system, state.displacement), state.frames, operators.spans
 
     assert isinstance(operators.mass, ComponentwiseMatrix)
-    parts = (operators.mass, system.stiffness, frames, turning, state.velocity)
+    places = system.points[system.contact_nodes] + system.normals.touched(state.displacement)
+    more = (system.gap - frames.gap) / dt
+    parts = (operators.mass, system.stiffness, frames, turning, state.velocity, places, more)
 
     def turned(number: int, problem: ContactProblem) -> ContactProblem | TurningProblem:
         problem = turned_problem(problem, here.normals)

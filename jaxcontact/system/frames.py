@@ -14,7 +14,7 @@ have R = S = I and wbar = W = y = 0. Source: MATH.md 12.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from jax import Array
 
 from jaxcontact.scene.obstacle import Obstacle
 from jaxcontact.system.small_matrices import axial, cayley, half_cayley, product, skew, solve_small
+from jaxcontact.system.sparse import ContactNormals
 
 #: Sweeps over (1) for each sweep over the step: an error falls by the strain of a step in each.
 INNER_SWEEPS = 2
@@ -42,6 +43,14 @@ class Meeting:
 
     nodes: np.ndarray
     """Their nodes, (P,) int32."""
+
+    is_concave: bool = field(metadata={"static": True})
+    """Whether it is concave, a bowl: a node is kept out of it by the tangent at its new place."""
+
+    def measure(self, places: Array) -> tuple[Array, Array]:
+        """Return the distances (P,) [m] of the nodes at places (P, d), and the normals (P, d)."""
+        distance, slope = jax.vmap(jax.value_and_grad(self.obstacle.signed_distance))(places)
+        return distance, -slope / jnp.linalg.norm(slope, axis=1, keepdims=True)
 
 
 @jax.tree_util.register_dataclass
@@ -65,11 +74,12 @@ class Frames:
     numbers: np.ndarray | None
     """Body of each node, (K,) int32, F for a node without frame; None if there is one body."""
 
-    places: np.ndarray
-    """Number of the node of each pair among the contact nodes, (C,) int32."""
+    places: np.ndarray | None
+    """Number of the node of each pair among the contact nodes, (C,) int32; None if each node has
+    one pair, in the same order."""
 
     unknowns: np.ndarray
-    """Unknowns of the contact nodes, one after the other, (c d,) int32."""
+    """Unknowns of the contact nodes, (d c,) int32: the first components of all, then the next."""
 
     gap: Array
     """Gaps in the reference configuration, (C,) [m]: where those of the system are others (see
@@ -77,6 +87,15 @@ class Frames:
 
     meetings: tuple[Meeting, ...]
     """Which pairs meet which obstacle; the gaps of bodies without frame stay linearised."""
+
+    def nodal_rows(self, dtype: np.dtype) -> ContactNormals:
+        """Return the components of the contact nodes as contact rows: normals of any direction."""
+        return ContactNormals(jnp.ones((len(self.unknowns), 1), dtype), self.unknowns[:, None])
+
+    @property
+    def is_concave(self) -> bool:
+        """Whether an obstacle is concave."""
+        return any(meeting.is_concave for meeting in self.meetings)
 
     def sums(self, left: Array, right: Array) -> Array:
         """Return sum left right^T over the nodes of each body, (F, i, j), of (K, i) and (K, j)."""
@@ -92,8 +111,10 @@ class Frames:
 
     def apply(self, matrices: Array, x: Array, rest: float = 0.0) -> Array:
         """Return the products of x (K, d) with the matrix of each body (F, d, d)."""
-        identity = rest * jnp.eye(x.shape[1], dtype=x.dtype)
-        return jnp.sum(self.spread(matrices, identity) * x[:, None, :], axis=-1)
+        d = x.shape[1]
+        turns = self.spread(matrices, rest * jnp.eye(d, dtype=x.dtype))
+        # Column by column, twenty times as fast as a sum over an axis of two or three.
+        return sum(turns[:, :, j] * x[:, j, None] for j in range(1, d)) + turns[:, :, 0] * x[:, :1]
 
 
 class FrameState(NamedTuple):
@@ -104,6 +125,19 @@ class FrameState(NamedTuple):
 
     deformation: Array
     """u in the frame of the body, (n,) [m]; the displacement of a body without frame."""
+
+
+class FrameStart(NamedTuple):
+    """The frames at the start of a step."""
+
+    rotation: Array
+    """R, (F, d, d)."""
+
+    places: Array
+    """q = R (X + u), (K, d) [m]."""
+
+    moment: Array
+    """sum m q X^T, (F, d, d) [kg m^2]."""
 
 
 class FrameStep(NamedTuple):
@@ -145,28 +179,29 @@ def initial_frames(frames: Frames, displacement: Array) -> FrameState:
     return FrameState(R, deformation.reshape(-1))
 
 
-def turned_places(frames: Frames, state: FrameState) -> Array:
-    """Return q = R (X + u), (K, d) [m]."""
+def frame_start(frames: Frames, state: FrameState) -> FrameStart:
+    """Return the frames at the start of a step."""
     u = state.deformation.reshape(frames.reference.shape)
-    return frames.apply(state.rotation, frames.reference + u, 1.0)
+    places = frames.apply(state.rotation, frames.reference + u, 1.0)
+    return FrameStart(state.rotation, places, frames.sums(places, frames.moments[:, 1:]))
 
 
 def turn(
-    frames: Frames, rotation: Array, places: Array, dt: Array, velocity: Array, increment: Array
+    frames: Frames, start: FrameStart, dt: Array, velocity: Array, increment: Array
 ) -> tuple[FrameStep, Array]:
     """Return the frames in a step with the velocity w, and W.
 
     Args:
         frames: the frames.
-        rotation: R, (F, d, d).
-        places: q, (K, d) [m].
+        start: of the step.
         dt: tau.
         velocity: w, (K, d) [m/s].
         increment: an approximation of the axial vector of W, (F, s).
     """
+    rotation, places, moment = start
     sums = frames.sums(velocity, frames.moments)
     mean, dG = sums[:, :, 0], dt * sums[:, :, 1:]
-    Gb = frames.sums(places, frames.moments[:, 1:]) + 0.5 * dG
+    Gb = moment + 0.5 * dG
     for _ in range(INNER_SWEEPS):
         S = product(half_cayley(increment), rotation)
         increment = solve_small(_jacobian(S, Gb), axial(product(jnp.swapaxes(S, 1, 2), dG)))

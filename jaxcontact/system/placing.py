@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxcontact.scene.facets import Facets
+from jaxcontact.scene.obstacle import Ball
 from jaxcontact.scene.scene import Scene
 from jaxcontact.system.bodies import body_numbers
 from jaxcontact.system.contact_pairs import merged_obstacles
@@ -53,14 +54,15 @@ def frames_of(scene: Scene, system: System, pairs: ContactPairs) -> Frames | Non
     is_whole = len(turning) == 1 and free.size == np.count_nonzero(members)
     contact_nodes = np.unique(pairs.nodes)
     positions = np.asarray(system.node_numbers)[contact_nodes].astype(np.int32)
+    places = np.searchsorted(contact_nodes, pairs.nodes)
     return Frames(
         reference=reference,
         origin=origin,
         moments=moments,
         members=None if is_whole else members,
         numbers=None if is_whole else numbers[free].astype(np.int32),
-        places=np.searchsorted(contact_nodes, pairs.nodes).astype(np.int32),
-        unknowns=(positions[:, None] * d + np.arange(d, dtype=np.int32)).reshape(-1),
+        places=None if np.array_equal(contact_nodes, pairs.nodes) else places.astype(np.int32),
+        unknowns=(positions * d + np.arange(d, dtype=np.int32)[:, None]).reshape(-1),
         gap=system.gap,
         meetings=tuple(_meetings(scene, pairs, numbers[pairs.nodes] < turning.size)),
     )
@@ -71,7 +73,8 @@ def _meetings(scene: Scene, pairs: ContactPairs, has_frame: np.ndarray) -> Itera
     for number, (_, obstacle, _) in enumerate(merged_obstacles(scene)):
         rows = np.flatnonzero(has_frame & (pairs.owner == number)).astype(np.int32)
         if rows.size and not isinstance(obstacle, Facets):
-            yield Meeting(obstacle, rows, pairs.nodes[rows])
+            is_concave = isinstance(obstacle, Ball) and obstacle.inside
+            yield Meeting(obstacle, rows, pairs.nodes[rows], is_concave)
 
 
 def deformation(system: System, displacement: Array) -> Array:
@@ -92,12 +95,23 @@ def gap_and_rows(system: System, displacement: Array) -> tuple[Array, Array]:
         return gap, rows
     for meeting in system.frames.meetings:
         places = system.points[meeting.nodes] + system.normals.touched(displacement)[meeting.pairs]
-        distance, slope = jax.vmap(jax.value_and_grad(meeting.obstacle.signed_distance))(places)
-        normals = -slope / jnp.linalg.norm(slope, axis=1, keepdims=True)
+        distance, normals = meeting.measure(places)
         more = (system.gap - system.frames.gap)[meeting.pairs]
         gap = gap.at[meeting.pairs].set(distance + more)
         rows = rows.at[meeting.pairs].set(normals)
     return gap, rows
+
+
+def rows_of_step(system: System, old: Array, new: Array) -> Array:
+    """Return the rows of N, (C, d), with which a step from y to y' (n,) was solved."""
+    rows = gap_and_rows(system, old)[1]
+    if system.frames is None or not system.frames.is_concave:
+        return rows
+    later = gap_and_rows(system, new)[1]
+    for meeting in system.frames.meetings:
+        if meeting.is_concave:
+            rows = rows.at[meeting.pairs].set(later[meeting.pairs])
+    return rows
 
 
 def placed(system: System, displacement: Array) -> System:

@@ -1,5 +1,6 @@
 """Bodies that turn by any angle: conservation, contact, ledger and what is refused."""
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -95,10 +96,12 @@ def test_rigid_body_turns_and_flies_as_one():
     np.testing.assert_allclose(motion.centre[:, 0], centre, atol=1e-11)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("dimension", "floor"), [(2, "plane"), (3, "plane"), (2, "ball"), (2, "bowl")]
+)
 @pytest.mark.parametrize("scheme", SCHEMES, ids=lambda x: type(x).__name__)
-def test_hit_balances_energy_and_momentum_and_does_not_penetrate(dimension, scheme):
-    stepper, control, motion = hit(dimension, scheme)
+def test_hit_balances_energy_and_momentum_and_does_not_penetrate(dimension, scheme, floor):
+    stepper, control, motion = hit(dimension, scheme, floor)
     ledger = jc.energy(stepper, motion, control)
     start = float(ledger.total[0])
     assert bool(jnp.any(motion.strong))
@@ -297,6 +300,22 @@ def test_stress_is_that_of_the_deformation_in_the_axes_of_the_body():
     )
     with pytest.raises(ValueError, match="large_rotation"):
         jc.stress(scene, turned, turned)
+
+
+def test_small_displacements_warn_of_a_body_that_turns():
+    points = np.asarray(MESHES[2].points)
+    two = jc.join({"still": MESHES[2], "spins": MESHES[2].moved(translation=[3.0, 0.0])})
+    material = jc.KelvinVoigt(young=1e6, poisson=0.3, density=1000.0)
+    stepper = jc.prepare(jc.discretize(jc.Scene(two, material)), DT)
+    velocity = np.zeros(two.points.shape)
+    arm = points - points.mean(axis=0)
+    velocity[len(points) :] = 3.0 * arm @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    start = jc.State(None, velocity)
+    with pytest.warns(UserWarning, match=r"body 1 .* 5 degrees at step 32, .*large_rotation"):
+        jc.simulate(stepper, steps=60, initial=start)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jc.simulate(stepper, steps=20, initial=start)
 
 
 def test_frames_are_asked_for_where_there_are_none():

@@ -29,8 +29,11 @@ def rotation(dimension, angle=0.5):
     return turn
 
 
-def parameters(dimension, spin=6.0, speed=3.0, height=0.03):
-    """The body turned by `rotation`, its lowest corner at the height above the floor"""
+def parameters(dimension, spin=6.0, speed=3.0, height=0.03, floor="plane"):
+    """The body turned by `rotation`, its lowest corner at the height above a plane
+
+    The top of a ball, or the bottom of a bowl, is at the origin of the plane.
+    """
     mesh, rng = MESHES[dimension], np.random.default_rng(dimension)
     e, points = np.eye(dimension)[-1], np.asarray(mesh.points)
     x = (points - points.mean(axis=0)) @ rotation(dimension).T
@@ -46,7 +49,11 @@ def parameters(dimension, spin=6.0, speed=3.0, height=0.03):
             "shear_viscosity": 200.0,
             "density": 1000.0,
         },
-        "floor": {"point": 0.0 * e, "normal": e + 0.1 * rng.normal(size=dimension)},
+        "floor": {
+            "plane": {"point": 0.0 * e, "normal": e + 0.1 * rng.normal(size=dimension)},
+            "ball": {"center": -3.0 * e, "radius": 3.0},
+            "bowl": {"center": 3.0 * e, "radius": 3.0},
+        }[floor],
         "points": points,
         "gravity": -9810.0 * e,
         "dt": DT,
@@ -64,10 +71,12 @@ def elastic(values):
     }
 
 
-@partial(jax.jit, static_argnames=("dimension", "scheme", "is_flight", "dtype"))
-def stepper_of(dimension, values, scheme=None, is_flight=False, dtype=jnp.float64):
+@partial(jax.jit, static_argnames=("dimension", "scheme", "is_flight", "is_bowl", "dtype"))
+def stepper_of(dimension, values, scheme=None, is_flight=False, is_bowl=False, dtype=jnp.float64):
     """The stepper of the block; in free flight without floor and weight"""
-    floor = jc.HalfSpace(**values["floor"])
+    is_round = "radius" in values["floor"]
+    kind = partial(jc.Ball, inside=is_bowl) if is_round else jc.HalfSpace
+    floor = kind(**values["floor"])
     scene = jc.Scene(
         MESHES[dimension].with_points(values["points"]),
         jc.KelvinVoigt(**values["material"]),
@@ -83,18 +92,18 @@ def initial_of(values):
 
 
 @cache
-def hit(dimension, scheme):
+def hit(dimension, scheme, floor="plane"):
     """Stepper, control and motion of the block that hits the floor with a corner"""
-    values = parameters(dimension)
-    stepper = stepper_of(dimension, values, scheme)
+    values = parameters(dimension, floor=floor)
+    stepper = stepper_of(dimension, values, scheme, is_bowl=floor == "bowl")
     motion = jc.simulate(stepper, values["control"], initial=initial_of(values))
     return stepper, values["control"], motion
 
 
-@partial(jax.jit, static_argnames=("dimension", "scheme"))
-def cost(dimension, values, scheme):
+@partial(jax.jit, static_argnames=("dimension", "scheme", "is_bowl"))
+def cost(dimension, values, scheme, is_bowl=False):
     """A cost in which states, impulses and gaps enter"""
-    stepper = stepper_of(dimension, values, scheme)
+    stepper = stepper_of(dimension, values, scheme, is_bowl=is_bowl)
     motion = jc.simulate(stepper, values["control"], initial=initial_of(values))
     weight = jnp.linspace(1.0, 2.0, values["points"].size).reshape(values["points"].shape)
     return (
