@@ -10,10 +10,10 @@ show.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from jaxcontact.accuracy.probe import Build, Choice, Probes, Quantity
 from jaxcontact.schemes import ContactImplicit, Scheme
@@ -61,7 +61,7 @@ def estimate_error(
     dt: float,
     modes: int | None = None,
     scheme: Scheme | None = None,
-    dtype: Any = jnp.float64,
+    dtype: DTypeLike = jnp.float64,
 ) -> ErrorEstimate:
     """Estimate the error of a quantity by 9 runs of it, 12 with modes, each compiled anew.
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxcontact.motion.stepper import Stepper, prepare
 from jaxcontact.motion.trajectory import Trajectory
@@ -42,7 +43,7 @@ class Choice(NamedTuple):
     scheme: Scheme = ContactImplicit()
     """Time-stepping scheme."""
 
-    dtype: Any = jnp.float64
+    dtype: DTypeLike = jnp.float64
     """Floating point type."""
 
     modes: int | None = None

@@ -13,11 +13,12 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from jaxcontact.accuracy.estimate import ErrorEstimate, parts_of_error
 from jaxcontact.accuracy.limits import limits
@@ -76,7 +77,7 @@ class Recommendation:
     scheme: Scheme
     """Time-stepping scheme."""
 
-    dtype: Any
+    dtype: DTypeLike
     """Floating point type."""
 
     error: float

@@ -20,7 +20,10 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeGuard
+
+#: A table of a TOML file.
+Table: TypeAlias = Mapping[str, Any]
 
 
 class SceneFileError(ValueError):
@@ -31,7 +34,7 @@ class SceneFileError(ValueError):
 class Key:
     """What the value of a key has to be."""
 
-    is_valid: Callable[[Any], bool]
+    is_valid: Callable[[object], bool]
     """Whether a value is allowed."""
 
     wanted: str
@@ -44,25 +47,23 @@ class Key:
 Keys = Mapping[str, Key]
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_vector(value: Any, length: int | None = None) -> bool:
-    is_list = isinstance(value, list) and all(map(_is_number, value))
-    return is_list and len(value) in ((1, 2, 3) if length is None else (length,))
+def _is_vector(value: object, length: int | None = None) -> bool:
+    lengths = (1, 2, 3) if length is None else (length,)
+    return isinstance(value, list) and len(value) in lengths and all(map(_is_number, value))
 
 
-def _is_rows(value: Any) -> bool:
-    is_list = isinstance(value, list) and all(isinstance(row, list) for row in value)
-    return (
-        is_list
-        and len(value) > 1
-        and all(all(map(_is_number, row)) and len(row) == len(value[0]) > 1 for row in value)
-    )
+def _is_rows(value: object) -> bool:
+    if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
+        return False
+    is_table = len(value) > 1 and all(len(row) == len(value[0]) > 1 for row in value)
+    return is_table and all(_is_number(x) for row in value for x in row)
 
 
-def _by_name(is_valid: Callable[[Any], bool]) -> Callable[[Any], bool]:
+def _by_name(is_valid: Callable[[object], bool]) -> Callable[[object], bool]:
     return lambda value: isinstance(value, dict) and all(map(is_valid, value.values()))
 
 
@@ -144,7 +145,7 @@ SECTIONS: Mapping[str, Keys] = {
 }
 
 
-def read_scene_file(path: str | Path) -> dict[str, Any]:
+def read_scene_file(path: str | Path) -> Table:
     """Return the tables of a scene file, all of them checked.
 
     Raises:
@@ -163,7 +164,7 @@ def read_scene_file(path: str | Path) -> dict[str, Any]:
     return tables
 
 
-def _check_file(tables: Mapping[str, Any]) -> list[str]:
+def _check_file(tables: Table) -> list[str]:
     """Return a line for each thing that is wrong."""
     named = {"mesh": True, "material": True, "sets": False, "contact": False}
     known = [*named, *SECTIONS]
@@ -190,7 +191,7 @@ def _check_file(tables: Mapping[str, Any]) -> list[str]:
     return wrong
 
 
-def _check_part(where: str, kind: str, table: Mapping[str, Any]) -> list[str]:
+def _check_part(where: str, kind: str, table: Table) -> list[str]:
     """Return what is wrong in a mesh, a material, a facet set or an obstacle."""
     if kind == "material":
         return _check_table(where, table, MATERIAL)
@@ -212,7 +213,7 @@ def _check_part(where: str, kind: str, table: Mapping[str, Any]) -> list[str]:
     return _check_table(where, table, keys)
 
 
-def _check_table(where: str, table: Mapping[str, Any], keys: Keys) -> list[str]:
+def _check_table(where: str, table: Table, keys: Keys) -> list[str]:
     """Return a line for each key of a table that is unknown, missing or has a wrong value."""
     wrong = []
     for name, value in table.items():

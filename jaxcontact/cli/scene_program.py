@@ -7,12 +7,10 @@ is written by its repr, after it was checked.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from jaxcontact.cli.scene_file import SCHEMES
+from jaxcontact.cli.scene_file import SCHEMES, Table
 
 _START = """\
 from pathlib import Path
@@ -72,7 +70,7 @@ class Program:
         return f"{self.build}\n{self.simulate}\n{self.output}"
 
 
-def scene_program(tables: Mapping[str, Any], folder: Path, out: Path) -> Program:
+def scene_program(tables: Table, folder: Path, out: Path) -> Program:
     """Return the program of checked tables.
 
     Args:
@@ -110,7 +108,7 @@ def scene_program(tables: Mapping[str, Any], folder: Path, out: Path) -> Program
     return Program(*("\n".join([*part, ""]) for part in (build, simulate, output)))
 
 
-def _mesh(tables: Mapping[str, Any], folder: Path) -> list[str]:
+def _mesh(tables: Table, folder: Path) -> list[str]:
     table = tables["mesh"]
     if all(isinstance(part, dict) for part in table.values()):
         bodies = [f"{name!r}: {_body(part, folder)}" for name, part in table.items()]
@@ -122,7 +120,7 @@ def _mesh(tables: Mapping[str, Any], folder: Path) -> list[str]:
     return lines
 
 
-def _body(table: Mapping[str, Any], folder: Path) -> str:
+def _body(table: Table, folder: Path) -> str:
     if "file" in table:
         more = f", dimension={table['dimension']}" if "dimension" in table else ""
         made = f"jc.read_mesh({str(folder / table['file'])!r}{more})"
@@ -136,7 +134,7 @@ def _body(table: Mapping[str, Any], folder: Path) -> str:
     return made + moved
 
 
-def _predicate(table: Mapping[str, Any]) -> str:
+def _predicate(table: Table) -> str:
     """Return a condition on centres x and outward normals n of facets."""
     conditions = []
     if "normal" in table:
@@ -150,7 +148,7 @@ def _predicate(table: Mapping[str, Any]) -> str:
     return " & ".join(conditions) or "np.ones(len(x), bool)"
 
 
-def _scene(tables: Mapping[str, Any]) -> list[str]:
+def _scene(tables: Table) -> list[str]:
     material, supports, loads = (tables.get(name, {}) for name in ("material", "supports", "loads"))
     if all(isinstance(part, dict) for part in material.values()):
         regions = [f"{name!r}: {_material(part)}" for name, part in material.items()]
@@ -169,11 +167,11 @@ def _scene(tables: Mapping[str, Any]) -> list[str]:
     return lines + ["large_rotation=True"] * tables["run"].get("large_rotation", False)
 
 
-def _material(table: Mapping[str, Any]) -> str:
+def _material(table: Table) -> str:
     return f"jc.KelvinVoigt({', '.join(f'{name}={value!r}' for name, value in table.items())})"
 
 
-def _obstacle(table: Mapping[str, Any]) -> str:
+def _obstacle(table: Table) -> str:
     kind = table["obstacle"]
     if kind == "plane":
         return f"jc.HalfSpace(point={table['point']!r}, normal={table['normal']!r})"
@@ -184,7 +182,7 @@ def _obstacle(table: Mapping[str, Any]) -> str:
     return f"jc.Ball(center={table['center']!r}, radius={table['radius']!r}{inside})"
 
 
-def _schedule(table: Mapping[str, Any]) -> list[str]:
+def _schedule(table: Table) -> list[str]:
     lines = []
     for name, value in table.items():
         levels = ", levels=True" if name in ("obstacle", "motion") else ""

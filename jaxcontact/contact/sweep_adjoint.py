@@ -11,7 +11,7 @@ sweeps is kept. Source: MATH.md 12.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +70,7 @@ def _solve_fwd(equation, fixed):
     return (unknowns, solution), Residuals(equation, nothing, unknowns, solution.active, asked)
 
 
-def _is_primal(x: Any) -> bool:
+def _is_primal(x: object) -> bool:
     return hasattr(x, "perturbed")
 
 

@@ -6,11 +6,13 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+from jaxcontact.transforms.trees import PyTree
 
 State = TypeVar("State")
 #: Called with the number of steps that are done and the number of all steps.
@@ -62,8 +64,8 @@ class Progress:
             )
 
     def watch(
-        self, step: Callable[[State, Any], tuple[State, Any]], inputs: Any, steps: int
-    ) -> tuple[Any, Any]:
+        self, step: Callable[[State, PyTree], tuple[State, PyTree]], inputs: PyTree, steps: int
+    ) -> tuple[PyTree, PyTree]:
         """Return a step that reports, and its inputs.
 
         Args:
@@ -77,7 +79,7 @@ class Progress:
 
         every = max(1, steps // 20) if self.every is None else self.every
 
-        def watched(state: State, inputs: tuple[Array, Any]) -> tuple[State, Any]:
+        def watched(state: State, inputs: tuple[Array, PyTree]) -> tuple[State, PyTree]:
             done, rest = inputs
             result = step(state, rest)
             is_time = (done % every == 0) | (done == steps)
