@@ -1,8 +1,10 @@
 """Which mesh, time step, scheme and model a quantity needs for a tolerance.
 
-From the coarsest mesh and step on, the one with the larger error for its price is halved, by
-e / log(cost ratio), until the sum of the errors is within the tolerance; a part below a fifth of it
-is left alone, and the coarsest mesh is never the answer: there its errors say nothing yet.
+From half the coarsest mesh size on, mesh size or step is halved, whichever has the larger error for
+its price, e / log(cost ratio), until the sum of the errors is within the tolerance; a part below a
+fifth of it is left alone. A mesh whose difference to the one before is more than four tolerances is
+no answer: nothing here converges faster than with h^2, so that a much smaller difference to the
+next mesh is chance.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ from jaxcontact.transforms.options import check_option
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Ratio of the errors of two meshes in second order.
+SECOND_ORDER = 4.0
 #: Part of the tolerance below which an error is not made smaller.
 NEGLIGIBLE = 0.2
 #: Time of a step grows with the number of unknowns to this power.
@@ -153,8 +157,8 @@ def recommend(
             its size, a mean over time and not an end value that may vanish.
         schemes: the time-stepping schemes to choose from.
         budget: seconds that the probes may take, compilation included; default 300.
-        h: the coarsest mesh size, [m]; default a quarter of the length of the body, which is
-            measured on the mesh of `build(1.0)`.
+        h: the coarsest mesh size, [m], which is only compared with; default a quarter of the length
+            of the body, which is measured on the mesh of `build(1.0)`.
         dt: the longest time step, [s]; default the time of a wave through a cell of that mesh.
 
     Returns:
@@ -211,7 +215,7 @@ def _refine(
     probes: Probes, choice: Choice, tolerance: float, deadline: float, evidence: list[Evidence]
 ) -> None:
     """Halve mesh size or time step until the tolerance is met or the time is up."""
-    coarsest = choice.h
+    choice = choice._replace(h=choice.h / 2)
     dimension = probes.system(choice).dimension
     price = {"h": dimension * GROWTH * math.log(2.0), "dt": math.log(2.0)}
     while True:
@@ -220,7 +224,8 @@ def _refine(
         choice = choice._replace(modes=PROBED_MODES if is_large else None)
         error = parts_of_error(probes, choice)
         allowed = tolerance * abs(error.value)
-        is_enough = error.total <= allowed and choice.h < coarsest
+        is_met = error.total <= allowed
+        is_enough = is_met and _change(probes, choice) <= SECOND_ORDER * allowed
         evidence.append(Evidence(choice, probes.system(choice).size, error, is_enough))
         spent = time.perf_counter() - begin
         # The next one takes at least as long.
@@ -231,12 +236,19 @@ def _refine(
             gain["h"] = 0.0
         if error.time <= NEGLIGIBLE * allowed:
             gain["dt"] = 0.0
-        # Within the tolerance on the coarsest mesh, or else what refining does not mend.
-        is_met = error.total <= allowed
+        # Within the tolerance by chance, or else what refining does not mend.
         if not is_met and not any(gain.values()):
             return
         is_mesh = is_met or gain["h"] >= gain["dt"]
         choice = choice._replace(h=choice.h / 2) if is_mesh else choice._replace(dt=choice.dt / 2)
+
+
+def _change(probes: Probes, choice: Choice) -> float:
+    """Return the difference of the quantity to that on the mesh of twice the size."""
+    coarser = choice._replace(h=2 * choice.h, modes=None)
+    if probes.system(coarser).size > LARGE:
+        coarser = coarser._replace(modes=choice.modes)
+    return probes.difference(coarser, choice)
 
 
 def _reduced(

@@ -152,7 +152,7 @@ def _solve(problem: jc.scenes.ControlProblem, options: argparse.Namespace, outpu
                 path,
                 values=lambda level: jnp.linalg.norm(result.control[max(level - 1, 0)], axis=1),
                 label="control [MN/m²]",
-                frames=40,
+                frames=24,
             )
         with output.writing("index.html") as path:
             write_page(path, summary, problem)

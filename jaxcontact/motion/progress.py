@@ -38,12 +38,13 @@ def print_progress(done: int, steps: int) -> None:
 class Progress:
     """Report how far a simulation is, every so many steps; also under jit, grad and vmap.
 
-    The reports come while the program runs; `jax.effects_barrier()` waits for the last one. A
-    program is compiled for its `report`: give a function that is defined once, no new lambda.
+    The reports come while the program runs; `jax.effects_barrier()` waits for the last one. Each
+    takes about a millisecond. A program is compiled for its `report`: give a function that is
+    defined once, no new lambda.
     """
 
-    every: int = 100
-    """Number of steps between reports."""
+    every: int | None = None
+    """Number of steps between reports; None is a twentieth of all steps."""
 
     report: Report = field(default=print_progress)
     """Called with the number of steps that are done and the number of all steps."""
@@ -54,7 +55,7 @@ class Progress:
         Raises:
             ValueError: if the number is not positive or the report is no function.
         """
-        if self.every < 1 or not callable(self.report):
+        if (self.every is not None and self.every < 1) or not callable(self.report):
             raise ValueError(
                 "Progress(every, report) takes a positive number of steps and a function of (done, "
                 f"steps), got {self.every!r} and {self.report!r}"
@@ -74,10 +75,12 @@ class Progress:
         def send(done: Array) -> None:
             self.report(int(done), steps)
 
+        every = max(1, steps // 20) if self.every is None else self.every
+
         def watched(state: State, inputs: tuple[Array, Any]) -> tuple[State, Any]:
             done, rest = inputs
             result = step(state, rest)
-            is_time = (done % self.every == 0) | (done == steps)
+            is_time = (done % every == 0) | (done == steps)
             jax.lax.cond(is_time, lambda: jax.debug.callback(send, done), lambda: None)
             return result
 

@@ -119,7 +119,7 @@ def simulate(
         check_option("weak_contact", weak_contact, kinds, "ClosedBranch()")
     check_frames(stepper.system, schedule, weak_contact)
     if progress is not None:
-        check_option("progress", progress, Progress, "Progress(every=100)")
+        check_option("progress", progress, Progress, "Progress()")
     initial = check_initial(start, initial)
     if control is not None:
         control = jnp.asarray(control, stepper.system.dtype)

@@ -30,7 +30,7 @@ from jaxcontact.system.courant import courant_number
 from jaxcontact.system.rollers import hold_matrix
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 from jaxcontact.system.system import System
-from jaxcontact.transforms.options import check_kind, check_option
+from jaxcontact.transforms.options import check_kind, check_option, is_positive_number
 from jaxcontact.transforms.precision import in_full_precision
 from jaxcontact.transforms.show import shown_by
 from jaxcontact.transforms.traced import is_traced
@@ -159,7 +159,7 @@ def prepare(
     check_kind("prepare", system, System, "system = jc.discretize(scene)")
     scheme = ContactImplicit() if scheme is None else scheme
     check_option("scheme", scheme, Scheme, "ContactImplicit()")
-    if not is_traced(dt) and not _is_positive(dt):
+    if not is_traced(dt) and not is_positive_number(dt):
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
     linear_solver, contact_solver = choose_solvers(system, linear_solver, contact_solver)
     dt = jnp.asarray(dt, system.dtype)
@@ -171,12 +171,6 @@ def prepare(
         )
     problems = tuple(factorize(system, x, linear_solver, contact_solver) for x in matrices)
     return Stepper(system, dt, Operators(mass, problems, spans), scheme, linear_solver)
-
-
-def _is_positive(dt: object) -> bool:
-    """Return whether a concrete value is one positive number."""
-    number = np.asarray(dt)
-    return number.shape == () and number.dtype.kind in "iuf" and bool(0.0 < number < np.inf)
 
 
 def choose_solvers(

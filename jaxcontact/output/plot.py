@@ -34,6 +34,7 @@ from jaxcontact.output.contact_plots import (
     plot_gap,
     plot_pressure,
 )
+from jaxcontact.output.space import space_body
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.system.system import System
 
@@ -54,6 +55,7 @@ __all__ = [
     "plot_mesh",
     "plot_pressure",
     "plot_state_error",
+    "space_body",
 ]
 
 

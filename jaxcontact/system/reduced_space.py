@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 import scipy.sparse.linalg
 from scipy.sparse import csr_array
 
+from jaxcontact.system.sparse import ComponentwiseMatrix, SymmetricMatrix
 from jaxcontact.system.system import System
 
 #: Up to so many unknowns all vibrations are computed at once.
@@ -26,7 +28,7 @@ Solve = Callable[[np.ndarray], np.ndarray]
 
 
 class HostSystem(NamedTuple):
-    """The matrices of the full system; n unknowns, C contact pairs."""
+    """The matrices of the full system; n unknowns, without those that rollers hold, C pairs."""
 
     mass: csr_array
     """M, (n, n) [kg]."""
@@ -43,17 +45,42 @@ class HostSystem(NamedTuple):
     contact_area: np.ndarray
     """Area of each pair, (C,) [m^(d-1)]."""
 
+    allowed: csr_array
+    """Z, orthonormal columns of all motions that rollers allow; the identity without rollers."""
+
     @classmethod
     def of(cls, system: System) -> HostSystem:
         """Return the matrices of a concrete system in double precision."""
-        B = system.viscosity
+        B, Z = system.viscosity, _allowed_motions(system)
+
+        def project(matrix: ComponentwiseMatrix | SymmetricMatrix) -> csr_array:
+            return csr_array(Z.T @ csr_array(matrix.to_scipy(), dtype=float) @ Z)
+
         return cls(
-            csr_array(system.mass.to_scipy(), dtype=float),
-            csr_array(system.stiffness.to_scipy(), dtype=float),
-            None if B is None else csr_array(B.to_scipy(), dtype=float),
-            csr_array(system.normals.to_scipy(), dtype=float),
+            project(system.mass),
+            project(system.stiffness),
+            None if B is None else project(B),
+            csr_array(csr_array(system.normals.to_scipy(), dtype=float) @ Z),
             np.asarray(system.contact_area, float),
+            Z,
         )
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, n."""
+        return self.mass.diagonal().size
+
+
+def _allowed_motions(system: System) -> csr_array:
+    """Return an orthonormal basis of what the rollers of a system allow."""
+    if system.rollers is None:
+        return csr_array(scipy.sparse.eye_array(system.size))
+    d, rows = system.dimension, np.asarray(system.rollers.weights, float)
+    node = np.asarray(system.rollers.unknowns)[:, 0] // d
+    blocks = [np.eye(d)] * (system.size // d)
+    for k in np.unique(node):
+        blocks[k] = scipy.linalg.null_space(rows[node == k])
+    return csr_array(scipy.sparse.block_diag(blocks))
 
 
 class Target(NamedTuple):
@@ -120,7 +147,8 @@ def space(
         dt: time step of the step responses; None is without them.
         others: what else the space shall hold, (n, m).
     """
-    mass, stiffness = system.mass, system.stiffness
+    mass, stiffness, Z = system.mass, system.stiffness, system.allowed
+    loads, snapshots = Z.T @ loads, Z.T @ snapshots
     # A free body has rigid motions, on which the stiffness vanishes: shift by a small frequency.
     shift = 1e-3 * _lowest_scale(mass, stiffness)
     solve = scipy.sparse.linalg.splu((stiffness + shift * mass).tocsc()).solve
@@ -140,8 +168,8 @@ def space(
             matrix = matrix + 0.5 * dt * system.viscosity
         vectors.append(scipy.sparse.linalg.splu(matrix.tocsc()).solve(pushes))
     if others is not None:
-        vectors.append(others)
-    return _orthonormal(mass, np.concatenate(vectors, axis=1)), vibrations.shape[1]
+        vectors.append(Z.T @ others)
+    return Z @ _orthonormal(mass, np.concatenate(vectors, axis=1)), vibrations.shape[1]
 
 
 def _vibrations(

@@ -76,9 +76,8 @@ def reduce(
         controls are (T, N, d) or, in the reduced space, (T, n), see `System.restrict_control`.
 
     Raises:
-        ValueError: if the system is traced, reduced already, has rollers or bodies that turn, not
-            exactly one of modes, frequency and tolerance is given, or an argument is out of its
-            range.
+        ValueError: if the system is traced, reduced already or has bodies that turn, not exactly
+            one of modes, frequency and tolerance is given, or an argument is out of its range.
     """
     if system.basis is not None:
         raise ValueError("the system is reduced already; reduce the full system instead")
@@ -87,17 +86,14 @@ def reduce(
             "modes of the reference configuration do not turn with a body; with "
             "large_rotation=True use the full system"
         )
-    if system.rollers is not None:
-        raise ValueError(
-            "a system with rollers is not reduced; clamp the facet set, or use the full system"
-        )
     matrices = (system.mass, system.stiffness, system.viscosity, system.normals, system.load)
     if is_traced((matrices, system.nodal_mass, loads)):
         raise ValueError(
             "reduce needs concrete matrices and loads, since it computes eigenvectors on the host; "
             "call it outside of jit, grad and vmap"
         )
-    target = Target.of(system.size, modes, frequency, tolerance)
+    n_held = 0 if system.rollers is None else system.rollers.count
+    target = Target.of(system.size - n_held, modes, frequency, tolerance)
     if step_responses is not None and not (np.ndim(step_responses) == 0 and step_responses > 0.0):
         raise ValueError(f"step_responses must be a time step in seconds, got {step_responses}")
     count = system.normals.count
@@ -127,10 +123,11 @@ def enrich(system: System, reduced: System, dt: float | None) -> System:
             "hand over a full system and a model that jc.reduce made of it, got systems of "
             f"{system.size} and {reduced.size} unknowns"
         )
-    modes = min(2 * basis.modes, system.size - 1)
     part = system.with_pairs(basis.pairs)
+    host = HostSystem.of(part)
+    modes = min(2 * basis.modes, host.size - 1)
     V, _ = space(
-        HostSystem.of(part),
+        host,
         _loads(system, ()),
         np.zeros((system.size, 0)),
         Target(modes, None, None),
@@ -219,6 +216,7 @@ def _project(system: System, V: np.ndarray, pairs: np.ndarray, modes: int) -> Sy
         l2_mass=l2_mass,
         normals=dense(system.normals),
         load=jnp.asarray(np.asarray(system.load, float) @ V, dtype),
+        rollers=None,
         basis=Basis(vectors, system.mass, system.normals, pairs, modes, mark),
         open_pairs=None
         if beside is None

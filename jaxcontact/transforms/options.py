@@ -5,8 +5,16 @@ from __future__ import annotations
 import sys
 import textwrap
 
+import numpy as np
+
 #: Longest text of a wrong value that a message quotes.
 MAX_QUOTE = 80
+
+
+def is_positive_number(value: object) -> bool:
+    """Return whether a concrete value is one positive, finite number."""
+    number = np.asarray(value)
+    return number.shape == () and number.dtype.kind in "iuf" and bool(0.0 < number < np.inf)
 
 
 def check_kind(call: str, value: object, kind: type, made_by: str) -> None:

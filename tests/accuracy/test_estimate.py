@@ -3,31 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.falling_bar import BAR, build, exact_mean, mean_height
 
 import jaxcontact as jc
-
-END = 2.0
-BAR = jc.reference.FallingBar()
-
-
-def build(h):
-    return jc.Scene(
-        mesh=jc.meshes.interval(BAR.length, h=h),
-        material=jc.KelvinVoigt(young=BAR.young, poisson=0.0),
-        contact={"left": jc.HalfSpace(point=[-BAR.gap], normal=[1.0])},
-        body_force=[-BAR.gravity],
-    )
-
-
-def mean_height(stepper):
-    """Mean displacement over the bar and over the time"""
-    motion = jc.simulate(stepper, steps=round(END / float(stepper.dt)))
-    return jnp.mean(motion.displacement)
-
-
-def exact_mean():
-    x, t = np.linspace(0.0, BAR.length, 401), np.linspace(0.0, END, 801)
-    return float(jnp.mean(BAR.displacement(x[None, :], t[:, None])))
 
 
 @pytest.fixture(scope="module")

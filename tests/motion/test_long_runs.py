@@ -64,6 +64,12 @@ def test_progress_is_reported_under_jit_and_grad_and_changes_no_gradient(stepper
     np.testing.assert_allclose(watched, plain, rtol=1e-12, atol=1e-15)
 
 
+def test_progress_is_reported_twenty_times_if_nothing_else_is_said(stepper):
+    jc.simulate(stepper, steps=60, progress=jc.Progress(report=note))
+    jax.effects_barrier()
+    assert CALLS == [(done, 60) for done in range(3, 61, 3)]
+
+
 def test_progress_of_a_batch_is_reported_once(stepper):
     controls = jnp.stack([random_control(6), 2.0 * random_control(6)])
     jax.vmap(lambda u: jc.simulate(stepper, u, progress=jc.Progress(3, note)).unknowns)(controls)

@@ -12,6 +12,7 @@ from support.thrown_bodies import DT, MESHES, STEPS, cost, initial_of, parameter
 
 import jaxcontact as jc
 from jaxcontact.system.basis import Basis
+from jaxcontact.system.rollers import hold
 from jaxcontact.system.sparse import ContactNormals, SymmetricMatrix
 
 RUBBER = jc.KelvinVoigt(young=1.0, poisson=0.3)
@@ -299,7 +300,20 @@ def test_wrong_rollers_are_refused(rollers, message):
         jc.discretize(scene_of(values, rollers))
 
 
-def test_reduced_model_of_rollers_is_refused():
-    system = jc.discretize(scene_of(parameters(2), {"left": None}))
-    with pytest.raises(ValueError, match="rollers is not reduced"):
-        jc.reduce(system, modes=4)
+def test_reduced_model_on_rollers_moves_as_the_full_one():
+    stepper = prepared(parameters(2), {"left": SLANTED[2]})
+    system = stepper.system
+    # With the responses to contact that is all that the rollers allow.
+    n_allowed = system.size - system.rollers.count
+    reduced = jc.reduce(system, modes=n_allowed - 1)
+    assert reduced.size == n_allowed
+    thrown = initial_of(parameters(2)).velocity
+    start = jc.State(velocity=system.lift(hold(system.rollers, system.restrict(thrown))))
+    found, expected = (
+        jc.simulate(x, steps=STEPS, initial=start) for x in (jc.prepare(reduced, DT), stepper)
+    )
+    assert np.any(expected.active)
+    size = np.max(np.abs(expected.displacement))
+    np.testing.assert_allclose(found.displacement, expected.displacement, atol=1e-10 * size)
+    few = jc.reduce(system, modes=2)
+    assert np.max(np.abs(system.rollers @ few.basis.vectors[:, 0])) < ROUNDING

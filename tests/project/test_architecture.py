@@ -26,7 +26,7 @@ LAYERS = (
 )
 RANK = {module: rank for rank, layer in enumerate(LAYERS) for module in layer}
 RUNTIME = {"jax", "jaxlib", "numpy", "scipy", "meshio", "optax"}
-OPTIONAL = {"gmsh", "matplotlib", "netCDF4", "tqdm"}
+OPTIONAL = {"gmsh", "matplotlib", "netCDF4", "pyvista", "tqdm"}
 MOST_LINES = 300
 
 FILES = sorted(ROOT.rglob("*.py"))
