@@ -1,19 +1,19 @@
 """Which optimiser gets how far? Value and stationarity against gradients and time.
 
-The paper's control problem, from u = 0, with every method, on three meshes and two horizons.
-Values are those of the exact problem, also for the homotopy in relaxed contact. The work of a run
-is its gradients plus twice its Hessian products, each the derivative of a gradient. Compilation
-is not timed: every method first makes one iteration that does not count. The residual of strong
-stationarity says what a method stopped at: a minimiser, or a kink. On the long horizon, where a
-gradient costs ten times as much, every method makes fewer iterations. The last lines that are
-printed answer the claims about the default problem, 8 rings and 150 steps.
+The paper's control problem, from u = 0: four meshes, bounds on the control, and a horizon ten times
+as long. Values are those of the exact problem, also for the homotopy in relaxed contact. The work
+of a run is its gradients and its Hessian products, each a sweep forward and one back, plus its gap
+rows, each at most a sweep. Compilation is not timed: every run is made twice. The residual of
+strong stationarity says what a method stopped at: a minimiser, or a kink. The last lines that are
+printed are the claims about the homotopy.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,23 +22,55 @@ import optax
 from common import measure
 
 import jaxcontact as jc
+from jaxcontact.control.problem import Problem
 from jaxcontact.optimize import LBFGS, NewtonCG
 
-DEFAULT = (8, 150)
-RINGS = [6, 8, 12]
-STEPS = [150, 1500]
-#: Method, its iterations, and those for runs of more than 150 steps.
+
+class Case(NamedTuple):
+    """One problem."""
+
+    rings: int
+    """Rings of cells of the half disc."""
+
+    steps: int = 150
+    """Time steps."""
+
+    bound: float | None = None
+    """Largest force density in each direction, or None."""
+
+    iterations: Mapping[str, int] = MappingProxyType({})
+    """Iterations of the methods that make others than by default; zero leaves one out."""
+
+    @property
+    def name(self) -> str:
+        """The title of its chart."""
+        bound = "" if self.bound is None else f", |u| <= {self.bound}"
+        return f"{self.rings} rings, {self.steps} steps{bound}"
+
+
+DEFAULT = Case(8, iterations={"steepest descent": 1000})
+SHORT = {"homotopy, path only": 0}
+CASES = [
+    Case(6, iterations=SHORT),
+    DEFAULT,
+    Case(12, iterations=SHORT),
+    Case(16, iterations=SHORT | {"steepest descent": 100, "adam": 0}),
+    Case(8, bound=0.5, iterations=SHORT),
+    Case(3, steps=1500, iterations=SHORT | {"adam": 60, "Newton-CG": 15}),
+]
+#: Method and its iterations.
 METHODS = {
-    "steepest descent": (jc.SteepestDescent(), 1000, 60),
-    "adam": (jc.Optax(optax.adam(0.02)), 200, 60),
-    "L-BFGS": (LBFGS(), 200, 60),
-    "Newton-CG": (NewtonCG(), 30, 6),
-    "homotopy": (jc.Homotopy(), 20, 3),
+    "steepest descent": (jc.SteepestDescent(), 200),
+    "adam": (jc.Optax(optax.adam(0.02)), 200),
+    "L-BFGS": (LBFGS(), 200),
+    "Newton-CG": (NewtonCG(), 30),
+    "homotopy, path only": (jc.Homotopy(finish=None), 20),
+    "homotopy": (jc.Homotopy(), 20),
 }
 QUICK_METHODS = {
-    "steepest descent": (jc.SteepestDescent(), 3, 3),
-    "L-BFGS": (LBFGS(), 3, 3),
-    "homotopy": (jc.Homotopy(levels=2), 20, 20),
+    "steepest descent": (jc.SteepestDescent(), 3),
+    "L-BFGS": (LBFGS(), 3),
+    "homotopy": (jc.Homotopy(), 20),
 }
 
 
@@ -47,16 +79,21 @@ def half_disc(rings: int, steps: int, dtype: Any) -> jc.scenes.ControlProblem:
     return jc.scenes.half_disc_control(h=jc.scenes.RADIUS / rings, steps=steps, dtype=dtype)
 
 
-def run(problem: jc.scenes.ControlProblem, method: Any, iterations: int) -> dict[str, Any]:
+def run(
+    problem: jc.scenes.ControlProblem, method: Any, iterations: int, bound: float | None
+) -> dict[str, Any]:
     """Return one row: a method on a problem."""
     start = jnp.zeros_like(problem.reference)
-    options = {"method": method, "system": problem.system, "dt": problem.dt}
-    if isinstance(method, jc.Homotopy):
-        warm = options | {"method": replace(method, max_steps=1)}
-    else:
-        warm = options
-    jc.optimize(problem.objective, start, iterations=1, **warm)
-    result = jc.optimize(problem.objective, start, iterations=iterations, **options)
+    for _ in range(2):
+        result = jc.optimize(
+            problem.objective,
+            start,
+            method=method,
+            iterations=iterations,
+            system=problem.system,
+            dt=problem.dt,
+            bounds=None if bound is None else (-bound, bound),
+        )
     history, certificate = result.history, result.stationarity
     row = {
         "unknowns": problem.system.size,
@@ -65,11 +102,13 @@ def run(problem: jc.scenes.ControlProblem, method: Any, iterations: int) -> dict
         "value": result.value,
         "gradients": int(history.evaluations[-1]),
         "hessian_products": int(history.hessian_products[-1]),
+        "rows": int(history.gap_rows[-1]),
+        "simulations": int(history.simulations[-1]),
         "seconds": float(history.seconds[-1]),
         "stationarity": None,
         "weak_pairs": None,
         "wrong_signs": None,
-        "status": result.status,
+        "status": result.status.name,
     }
     if certificate is not None:
         row |= {
@@ -85,45 +124,39 @@ def run(problem: jc.scenes.ControlProblem, method: Any, iterations: int) -> dict
 
 
 def work_of(history: dict[str, list]) -> np.ndarray:
-    """Return the work at every iteration, gradients plus twice the Hessian products."""
-    return np.add(history["evaluations"], 2 * np.array(history["hessian_products"]))
+    """Return the work at every iteration: gradients and Hessian products."""
+    return np.add(history["evaluations"], history["hessian_products"])
+
+
+def product_time(problem: jc.scenes.ControlProblem) -> dict[str, float]:
+    """Return the time of a value with its gradient, and of a product with a linearised motion."""
+    reduced = Problem.of(problem.objective, problem.reference, system=problem.system, dt=problem.dt)
+    product = reduced.hessian(problem.reference)
+    runs = {
+        "gradient": lambda: reduced.evaluate(problem.reference),
+        "product": lambda: product(problem.reference),
+    }
+    seconds = measure.interleaved_seconds(runs, 15)
+    return {"gradient_ms": 1e3 * seconds["gradient"], "product_ms": 1e3 * seconds["product"]}
 
 
 def answers(rows: list[dict[str, Any]]) -> list[str]:
-    """Return one line per claim about the default problem."""
-    chosen = {r["name"]: r for r in rows if (r["rings"], r["steps"]) == DEFAULT}
-    if not {"steepest descent", "L-BFGS", "homotopy"} <= set(chosen):
-        return []
-    descent, best = chosen["steepest descent"], min(row["value"] for row in chosen.values())
-    lines = [f"steepest descent ends at {descent['value']:.7f} ({descent['status']})"]
-    for name, asked in (("L-BFGS", "60 gradients"), ("homotopy", "25 gradients + 500 products")):
-        history = chosen[name]["history"]
-        below = np.flatnonzero(np.array(history["value"]) < descent["value"])
-        reached = "never"
-        if below.size:
-            counts = history["evaluations"][below[0]], history["hessian_products"][below[0]]
-            reached = "{} gradients + {} products".format(*counts)
-        lines.append(f"{name} is below it after {reached}; asked: {asked}")
-    for row in chosen.values():
-        if row["stationarity"] is not None:
-            lines.append(
-                f"{row['name']} ends at a strong stationarity of {row['stationarity']:.2e} after "
-                f"{row['gradients']} gradients + {row['hessian_products']} products, "
-                f"{row['weak_pairs']} weak pairs, {row['wrong_signs']} with a wrong sign"
-            )
-    lines.append("asked of the homotopy: 1e-8, 300 gradients + 3000 products, no wrong sign")
-    for name, row in chosen.items():
-        near = np.flatnonzero(np.array(row["history"]["value"]) <= 1.001 * best)
-        when = f"{row['history']['seconds'][near[0]]:.1f} s" if near.size else "never"
-        lines.append(f"{name} is within 1e-3 of the best value after {when}; asked of one: 10 s")
-    return lines
+    """Return one line for every homotopy."""
+    return [
+        f"{row['problem']}: {row['status']} after {row['gradients']} gradients, {row['rows']} rows "
+        f"and {row['hessian_products']} products, {row['seconds']:.1f} s; residual "
+        f"{row['stationarity']:.1e}, {row['weak_pairs']} weak pairs, {row['wrong_signs']} with a "
+        "wrong sign"
+        for row in rows
+        if row["name"] == "homotopy" and row["stationarity"] is not None
+    ]
 
 
 def draw_default(rows: list[dict[str, Any]], out: Path) -> None:
     """Draw value and gradient norm of the default problem against work and time."""
     import matplotlib.pyplot as plt
 
-    chosen = [row for row in rows if (row["rings"], row["steps"]) == DEFAULT]
+    chosen = [row for row in rows if row["problem"] == DEFAULT.name]
     if not chosen:
         return
     best = min(row["value"] for row in chosen)
@@ -137,7 +170,7 @@ def draw_default(rows: list[dict[str, Any]], out: Path) -> None:
             axes[1, column].loglog(x, norms, ".-", label=row["name"])
     axes[0, 0].set_ylabel("lowest value / best value - 1")
     axes[1, 0].set_ylabel("norm of the exact gradient / first one")
-    axes[1, 0].set_xlabel("gradients + 2 products")
+    axes[1, 0].set_xlabel("gradients + Hessian products")
     axes[1, 1].set_xlabel("seconds")
     axes[0, 0].legend(fontsize=8)
     for panel in axes.flat:
@@ -147,34 +180,40 @@ def draw_default(rows: list[dict[str, Any]], out: Path) -> None:
 
 
 def draw(rows: list[dict[str, Any]], out: Path) -> None:
-    """Draw the lowest value so far above the best one against work, one panel per problem."""
+    """Draw the residual at which every method ends against its work, one panel per problem."""
     import matplotlib.pyplot as plt
 
-    problems = sorted({(row["steps"], row["unknowns"]) for row in rows})
-    columns = len({unknowns for _, unknowns in problems})
+    problems = list(dict.fromkeys(row["problem"] for row in rows))
+    columns = min(3, len(problems))
     lines = -(-len(problems) // columns)
     figure, axes = plt.subplots(
         lines,
         columns,
-        figsize=(4.2 * columns, 3.6 * lines),
+        figsize=(4.0 * columns, 3.2 * lines),
         squeeze=False,
         sharey=True,
         layout="constrained",
     )
-    for panel, (steps, unknowns) in zip(axes.flat, problems, strict=False):
-        chosen = [row for row in rows if (row["steps"], row["unknowns"]) == (steps, unknowns)]
-        best = min(row["value"] for row in chosen)
-        for row in chosen:
-            history = row["history"]
-            lowest = np.minimum.accumulate(history["value"]) / best - 1.0
-            label = row["name"]
-            if row["stationarity"] is not None:
-                label += f" ({row['stationarity']:.0e})"
-            panel.loglog(work_of(history), np.maximum(lowest, 1e-10), ".-", label=label)
-        panel.set(title=f"{unknowns} unknowns, {steps} steps", xlabel="gradients + 2 products")
-        panel.legend(title="relative stationarity", fontsize=7, title_fontsize=7)
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    for panel, problem in zip(axes.flat, problems, strict=False):
+        best = min(row["value"] for row in rows if row["problem"] == problem)
+        for row in rows:
+            if row["problem"] != problem or row["stationarity"] is None:
+                continue
+            panel.loglog(
+                work_of(row["history"])[-1],
+                row["stationarity"],
+                "*" if row["name"] == "homotopy" else "o",
+                markersize=12 if row["name"] == "homotopy" else 7,
+                color=f"C{names.index(row['name'])}",
+                label=f"{row['name']} (+ {100 * (row['value'] / best - 1):.2g} %)",
+            )
+        panel.axhline(1e-10, color="0.7", linewidth=1.0)
+        panel.set(title=problem, xlabel="gradients + Hessian products")
+        panel.legend(title="and value above the best", fontsize=7, title_fontsize=7)
         panel.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("lowest value / best value - 1")
+    for line in axes:
+        line[0].set_ylabel("residual of strong stationarity")
     measure.save_chart(figure, "optimizers", out)
     plt.close(figure)
 
@@ -182,28 +221,30 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
 def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
     """Run the benchmark; return its rows."""
     arguments = measure.parser(__doc__)
-    arguments.add_argument("--rings", type=int, nargs="*", default=RINGS)
-    arguments.add_argument("--steps", type=int, nargs="*", default=STEPS)
+    arguments.add_argument("--cases", type=int, nargs="*", default=range(len(CASES)))
     options = measure.parse(arguments, argv)
-    methods = METHODS
+    cases, methods = [CASES[k] for k in options.cases], METHODS
     if options.quick:
-        options.rings, options.steps, methods = [3], [20], QUICK_METHODS
-    rows = []
-    for steps in options.steps:
-        for rings in options.rings:
-            problem = half_disc(rings, steps, options.dtype)
-            for name, (method, short, long) in methods.items():
-                iterations = short if steps <= 150 else long
-                row = {"name": name, "rings": rings, **run(problem, method, iterations)}
-                measure.print_table([{k: v for k, v in row.items() if k != "history"}])
-                rows.append(row)
-            # After every problem, so that an interrupted run leaves what it has.
-            measure.save("optimizers", rows, options.out, dtype=str(options.dtype))
-            if not options.quick:
-                jax.clear_caches()  # programs of another shape are of no use to the next problem
+        cases, methods = [Case(3, steps=20)], QUICK_METHODS
+    rows, times = [], {}
+    for case in cases:
+        problem = half_disc(case.rings, case.steps, options.dtype)
+        for name, (method, by_default) in methods.items():
+            iterations = case.iterations.get(name, by_default)
+            if not iterations:
+                continue
+            row = {"name": name, "problem": case.name}
+            row |= run(problem, method, iterations, case.bound)
+            measure.print_table([{k: v for k, v in row.items() if k != "history"}])
+            rows.append(row)
+        times[case.name] = product_time(problem)
+        # After every problem, so that an interrupted run leaves what it has.
+        measure.save("optimizers", rows, options.out, dtype=str(options.dtype), times=times)
+        jax.clear_caches()  # programs of another shape are of no use to the next problem
     draw(rows, options.out)
     draw_default(rows, options.out)
     print("\n".join(answers(rows)))
+    print(times)
     return rows
 
 

@@ -76,7 +76,7 @@ def draw(rows: list[dict], out: Path) -> None:
                 f"{row['n']}",
                 (row["gradient_s"], row["displacement"]),
                 textcoords="offset points",
-                xytext=(7, 5),
+                xytext=(7, 5) if model == "full" else (-20, -3),
                 color=color,
             )
     axis.set(xlabel="time for value and gradient [s]", ylabel="relative error")

@@ -188,7 +188,8 @@ def _run(
     )
 
     if control is not None and system.basis is not None:
-        # One product with the basis for all steps, not one in each of them.
+        # One product with the basis for all steps, not one in each of them. The sparse product of a
+        # full model takes as long in the step, and leaves no second array of all controls.
         control = control_loads(system, control)
 
     def advance(state: StepState, inputs: tuple[Array | None, StepPerturbation, StepDrive | None]):

@@ -42,6 +42,8 @@ class Row(NamedTuple):
     gradient_norm: float
     evaluations: int
     hessian_products: int
+    gap_rows: int
+    simulations: int
     seconds: float
 
 
@@ -224,8 +226,9 @@ def _continued(problem: Problem, method: Method, start: Array, earlier: Result) 
     columns = (column.tolist() for column in astuple(earlier.history))
     rows = tuple(map(Row, *columns))
     # Checking the result was no work of the run.
-    counts = problem.counts
-    counts.evaluations, counts.hessian_products = rows[-1].evaluations, rows[-1].hessian_products
+    counts, last = problem.counts, rows[-1]
+    counts.evaluations, counts.hessian_products = last.evaluations, last.hessian_products
+    counts.rows, counts.motions = last.gap_rows, last.simulations
     best = unknown._replace(value=jnp.asarray(earlier.value, point.value.dtype))
     return Run(state, point if point.value < best.value else best, rows)
 
@@ -237,6 +240,8 @@ def _row(problem: Problem, point: Point, begin: float) -> Row:
         gradient_norm=float(problem.gradient_norm(point)),
         evaluations=counts.evaluations,
         hessian_products=counts.hessian_products,
+        gap_rows=counts.rows,
+        simulations=counts.motions,
         seconds=time.perf_counter() - begin,
     )
 

@@ -25,6 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from jaxcontact.control.bounds import mask
@@ -126,8 +127,13 @@ class ExactFinish:
             least = min(least, found.residual)
             if found.residual <= wanted or patience == 0:
                 break
+            rest = mask(found.rows.free, found.rest)
+            if not float(jnp.vdot(rest, found.rows.project(rest))) > 0.0:
+                # Nothing is free to move, but what a bound holds may not be there yet.
+                found = fixed.at(found.parameters + found.to_bounds, found, curvature)
+                continue
             path = conjugate_gradient_path(
-                mask(found.rows.free, found.rest),
+                rest,
                 fixed.smooth.hessian(found.parameters),
                 found.rows.project,
                 radius=math.inf,

@@ -34,6 +34,12 @@ class History:
     hessian_products: np.ndarray
     """Products with the Hessian so far, (K+1,) int."""
 
+    gap_rows: np.ndarray
+    """Derivatives of the gap of one pair in one step so far, (K+1,) int; of an exact finish."""
+
+    simulations: np.ndarray
+    """Motions without a derivative so far, (K+1,) int; of an exact finish."""
+
     seconds: np.ndarray
     """Time since the start, compilation included, (K+1,) [s]."""
 

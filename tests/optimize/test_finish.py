@@ -1,5 +1,7 @@
 """The exact finish of a homotopy: the pattern of contact, and what its certificate proves."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,6 +140,37 @@ def test_finish_mends_a_wrong_pattern(disc, result):
     # Strongly stationary controls lie close together: it may be another one.
     assert end.is_right
     assert float(disc.objective(end.parameters)) == pytest.approx(result.value, rel=1e-2)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pressed:
+    """The half disc under a cost that is not quadratic on a pattern, with a target of force."""
+
+    disc: jc.scenes.ControlProblem
+    force: jax.Array
+
+    def simulate(self, u):
+        return self.disc.simulate(u)
+
+    def objective(self, u):
+        motion = self.simulate(u)
+        missing = jnp.sum(motion.contact_force, axis=1) - self.force
+        miss = jnp.mean(missing**2) / jnp.mean(self.force**2)
+        effort = jc.control_dot(self.disc.system, self.disc.dt, u, u)
+        return miss + 0.1 * miss**2 + self.disc.control_weight * effort
+
+
+def test_finish_of_a_force_target_takes_newton_steps_on_the_pattern(disc):
+    start = disc.reference
+    problem = Pressed(disc, 1.5 * jnp.sum(disc.simulate(start).contact_force, axis=1))
+    result = jc.optimize(
+        problem.objective, start, method=jc.Homotopy(), system=disc.system, dt=disc.dt
+    )
+    assert result.status is jc.Ending.CERTIFIED
+    assert result.stationarity.is_strong
+    assert result.stationarity.residual < EXACT * result.history.gradient_norm[0]
+    assert result.value < 0.1 * float(problem.objective(start))
 
 
 def cost(stepper, u):
