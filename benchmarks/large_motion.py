@@ -286,7 +286,7 @@ def main(argv: list[str] | None = None) -> list[dict]:
     for d in (2,) if quick else (2, 3):
         rows.append(conservation(d, 300 if quick else 10_000))
         for scheme in (jc.ContactImplicit(), jc.ContactStabilized()):
-            rows.append(tumble(d, scheme, 500 if quick else 100_000 if d == 2 else 30_000))
+            rows.append(tumble(d, scheme, 500 if quick else 100_000 if d == 2 else 10_000))
             jax.clear_caches()
     for n in (300,) if quick else (10_000,):
         rows += [cost(n, is_contact, 100, options.repeats) for is_contact in (False, True)]
