@@ -266,7 +266,10 @@ def draw(rows: list[dict], out: Path) -> None:
                 x, y = ([row[key] for row in mine] for key in ("unknowns", f"{name}_A"))
                 axis.loglog(x, y, **style)
                 axis.set(xlabel="unknowns", title=f"error of the {name}")
+                axis.set_ylabel("relative error")
     for axis in axes:
+        axis.set_xticks([30, 50, 100, 200], ["30", "50", "100", "200"])
+        axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=7)
     measure.save_chart(figure, "reduction", out)

@@ -8,7 +8,7 @@
 [loads]             constant forces
 [schedule]          forces and motions as rows of a time and values, linear in between
 [start]             displacement and velocity at time zero
-[run]               time step, number of steps, scheme
+[run]               time step, number of steps, scheme, whether free bodies turn
 [output]            what is written
 """
 
@@ -137,6 +137,7 @@ SECTIONS: Mapping[str, Keys] = {
         "dt": Key(POSITIVE.is_valid, "a positive time [s]", True),
         "steps": Key(COUNT.is_valid, COUNT.wanted, True),
         "save_every": COUNT,
+        "large_rotation": FLAG,
         "scheme": Key(_choice(*SCHEMES).is_valid, _choice(*SCHEMES).wanted),
     },
     "output": dict.fromkeys(("series", "animation", "force", "stress", "trajectory"), FLAG),

@@ -165,7 +165,8 @@ def _scene(tables: Mapping[str, Any]) -> list[str]:
     if tables.get("contact"):
         obstacles = [f"{name!r}: {_obstacle(part)}" for name, part in tables["contact"].items()]
         lines.append("\n    ".join(_call("contact={", obstacles, "}")))
-    return lines + [f"{name}={value!r}" for name, value in loads.items()]
+    lines += [f"{name}={value!r}" for name, value in loads.items()]
+    return lines + ["large_rotation=True"] * tables["run"].get("large_rotation", False)
 
 
 def _material(table: Mapping[str, Any]) -> str:

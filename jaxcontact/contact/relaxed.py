@@ -46,6 +46,9 @@ class RelaxedContact:
     before touch, and have derivatives of every order: the law for homotopies and for starts that
     do not touch. A pair never touches. `kappa` is a leaf: a new value compiles nothing.
 
+    Two pairs in one place press twice as hard as one. Where positions are concrete, `discretize`
+    makes one pair of them; traced ones stay two.
+
     Of a trajectory of the contact-implicit scheme, lam_i gap_i = 2 tau kappa in every step, i.e.
     (mean contact force) x (gap) = 2 kappa.
 

@@ -73,7 +73,16 @@ class L2:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Euclidean:
-    """The inner product sum p q of parameters that are no control; all should be of one size."""
+    """The inner product sum p q of parameters that are no control; all should be of one size.
+
+    Example:
+        >>> target = jnp.array([1.0, 2.0])
+        >>> result = jc.optimize(
+        ...     lambda p: jnp.sum((p - target) ** 2), jnp.zeros(2), inner_product=jc.Euclidean()
+        ... )
+        >>> result.parameters.round(6)
+        Array([1., 2.], dtype=float64)
+    """
 
     def dot(self, first: Array, second: Array) -> Array:
         """Return the inner product of two elements, a scalar."""

@@ -79,6 +79,13 @@ def energy(stepper: Stepper, trajectory: Trajectory, control: Array | None = Non
     Returns:
         Energies and flows; the identity of the module docstring holds to rounding.
 
+    Example:
+        >>> stepper = jc.prepare(jc.discretize(jc.scenes.bar_on_wall()), 2e-6)
+        >>> thrown = jc.State(velocity=jnp.full((21, 1), -202.2))
+        >>> ledger = jc.energy(stepper, jc.simulate(stepper, steps=60, initial=thrown))
+        >>> bool(jnp.all(jnp.abs(ledger.residual) < 1e-12 * ledger.total[0]))
+        True
+
     Raises:
         ValueError: if the trajectory was recorded with a save_every other than 1, or is one of
             another system, or the control has another shape.

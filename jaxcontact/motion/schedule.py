@@ -126,6 +126,11 @@ def sample(
 
     Derivative: by what the function depends on, if it is written with jax.numpy; any other function
     of a float is evaluated time by time.
+
+    Example:
+        >>> stepper = jc.prepare(jc.discretize(jc.scenes.bar_on_wall()), 0.5)
+        >>> jc.sample(lambda t: 2.0 * t, stepper, 3)
+        Array([0.5, 1.5, 2.5], dtype=float64)
     """
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
         raise ValueError(f"steps must be a positive whole number, got {steps!r}")

@@ -47,6 +47,11 @@ class State:
                 nodes.
 
         Derivative: by the vectors.
+
+        Example:
+            >>> thrown = jc.State.of(jc.scenes.bars(), velocity={"bar0": [1.0]})
+            >>> thrown.velocity.shape
+            (102, 1)
         """
         return cls(
             _nodal_field(scene, "displacement", displacement),

@@ -107,6 +107,11 @@ def stress(scene: Scene, displacement: ArrayLike, velocity: ArrayLike | None = N
 
     Derivative: by displacement, velocity, material and node positions. The principal stresses have
     none where two of them are equal; where it is zero, that of the von Mises stress is zero.
+
+    Example:
+        >>> bar = jc.Scene(jc.meshes.interval(1.0, h=0.5), jc.KelvinVoigt(young=2.0, poisson=0.0))
+        >>> jc.stress(bar, 0.1 * bar.mesh.points).cells.ravel()  # stretched by a tenth
+        Array([0.2, 0.2], dtype=float64)
     """
     check_scene(scene)
     displacement = as_array(displacement)

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxcontact.contact import Status
 from jaxcontact.motion.contact_record import ContactRecord
 from jaxcontact.motion.frame_motion import FrameMotion, turning
 from jaxcontact.motion.nodal_fields import NodalFields
 from jaxcontact.motion.schedule import Schedule
 from jaxcontact.motion.state import State
 from jaxcontact.transforms.saved import save_dataclass
+from jaxcontact.transforms.show import shown_by
 from jaxcontact.transforms.traced import is_traced
 
 
@@ -72,6 +75,26 @@ class Trajectory:
     def centre(self) -> Array:
         """Mass centre of each body that turns, (T+1, F, d) [m]; a ValueError if none does."""
         return turning(self.frames).centre
+
+    def _facts(self) -> dict[str, object]:
+        if is_traced(self):
+            return {"steps": self.contact_impulse.shape[-2], "values": "traced"}
+        status, counts = np.unique(np.asarray(self.status), return_counts=True)
+        total = np.asarray(self.contact_force).sum(axis=-1)
+        return {
+            "steps": total.shape[-1],
+            "batch": "x".join(map(str, total.shape[:-1])),
+            "end": f"{np.max(np.asarray(self.time)):.4g} s",
+            "unknowns": self.unknowns.shape[-1],
+            "contact_pairs": self.gap.shape[-1],
+            "status": {
+                Status(int(kind)).name.lower(): int(count)
+                for kind, count in zip(status, counts, strict=True)
+            },
+            "largest_force": f"{np.max(total, initial=0.0):.4g} N",
+        }
+
+    __repr__, _repr_html_ = shown_by(_facts)
 
     @property
     def unknowns(self) -> Array:

@@ -224,6 +224,8 @@ class _Deck:
                 for number in self._members(sets, kind, entry)
             ]
         ranges = [[int(x) for x in row if x] for row in section.rows]
+        if any(len(row) not in (2, 3) for row in ranges):
+            raise ValueError("GENERATE takes first, last and increment in a line")
         numbers = [k for first, last, *step in ranges for k in range(first, last + 1, *step)]
         return [self._number(kind, number) for number in numbers]
 

@@ -15,6 +15,7 @@ from jaxcontact.scene.abaqus import read_deck
 from jaxcontact.scene.cells import boundary_facets, cell_volumes
 from jaxcontact.scene.exodus import read_exodus
 from jaxcontact.scene.file_groups import SIMPLICES, boundary_groups, cell_groups, node_groups
+from jaxcontact.scene.gmsh_numbers import check_node_numbers
 from jaxcontact.scene.mesh import Mesh
 from jaxcontact.scene.split_cells import make_simplicial
 from jaxcontact.transforms.files import check_is_file
@@ -185,6 +186,8 @@ def _read(path: Path) -> meshio.Mesh:
         return read_deck(path)
     with path.open("rb"):
         pass
+    if path.suffix.lower() == ".msh":
+        check_node_numbers(path)
     # meshio prints why a format did not fit and, when none is left, ends the interpreter.
     said = io.StringIO()
     try:

@@ -27,6 +27,11 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
             regions get one name.
 
     Derivative: by the points of every body.
+
+    Example:
+        >>> bar = jc.meshes.interval(1.0, h=0.5)
+        >>> sorted(jc.join({"a": bar, "b": bar.moved(translation=[1.1])}).facets)
+        ['a/left', 'a/right', 'b/left', 'b/right']
     """
     if not meshes or not all(isinstance(name, str) for name in meshes):
         raise ValueError(f"join needs bodies by name, got the names {list(meshes)}")

@@ -40,6 +40,11 @@ class KelvinVoigt:
 
     Each field is a scalar, or one value per cell of the mesh, (E,). The values are checked by
     `discretize`; values that are out of range while JAX traces them make NaN matrices.
+
+    Example:
+        >>> steel = jc.KelvinVoigt(young=2.1e11, poisson=0.3, density=7850.0)
+        >>> print("{:.3g} {:.3g} Pa".format(*steel.elastic_lame()))
+        1.21e+11 8.08e+10 Pa
     """
 
     young: Number

@@ -34,7 +34,13 @@ class Obstacle(Protocol):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class HalfSpace:
-    """The obstacle {x: normal . (x - point) <= 0}, bounded by a plane (2D: line, 1D: point)."""
+    """The obstacle {x: normal . (x - point) <= 0}, bounded by a plane (2D: line, 1D: point).
+
+    Example:
+        >>> floor = jc.HalfSpace(point=[0.0, -1.0], normal=[0.0, 1.0])
+        >>> float(floor.signed_distance(jnp.array([5.0, 2.0])))
+        3.0
+    """
 
     point: Array | np.ndarray
     """A point of the bounding plane, (d,) [m]."""

@@ -61,8 +61,10 @@ def make_simplicial(path: Path, source: meshio.Mesh) -> None:
         source: what was read; other cells stay as they are.
 
     Raises:
-        ValueError: if a cell names nodes that there are not, or is not convex.
+        ValueError: if there are no nodes, a cell names others, or is not convex.
     """
+    if np.ndim(source.points) != 2:
+        raise ValueError(f"{path}: there is no table of node positions; is the file whole?")
     points = np.asarray(source.points, float)
     points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])]) if len(points) else points
     blocks: list[tuple[str, np.ndarray]] = []

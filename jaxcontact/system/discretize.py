@@ -45,6 +45,13 @@ def discretize(scene: Scene, dtype=jnp.float64) -> System:
     Raises:
         ValueError: if the scene is inconsistent (see `check_scene`) or leaves nothing to move.
         RuntimeError: if float64 is asked for while JAX has it switched off.
+
+    Example:
+        >>> system = jc.discretize(jc.scenes.bar_on_wall())
+        >>> system.size, system.gap
+        (21, Array([0.01], dtype=float64))
+        >>> print(f"{system.mass.to_scipy().sum():.4f}")  # density times length
+        0.0073
     """
     dtype = jnp.dtype(dtype)
     _check_dtype(dtype)

@@ -121,6 +121,12 @@ def test_scene_file_with_several_wrong_keys_has_a_line_for_each(tmp_path, capsys
     assert capsys.readouterr().err.count("bar.toml: ") == 4  # two unknown, two missing
 
 
+def test_scene_file_lets_free_bodies_turn_if_it_says_so(tmp_path, capsys):
+    path = scene_file(tmp_path, ("dt = 0.05", "dt = 0.05\nlarge_rotation = true"))
+    assert main(["run", str(path), "--as-python"]) == 0
+    assert "    large_rotation=True,\n" in capsys.readouterr().out
+
+
 def test_check_says_what_only_the_mesh_tells(tmp_path, capsys):
     path = scene_file(tmp_path, ("contact.left", "contact.lfet"))
     assert main(["check", str(path)]) == 2

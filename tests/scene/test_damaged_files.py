@@ -30,3 +30,11 @@ def test_no_reader_waits_for_the_rest_of_a_file(whole, tmp_path):
         for size in range(0, len(whole[name]), 7):
             path.write_bytes(whole[name][:size])
             assert isinstance(damage.read(path), (str, *damage.DOCUMENTED)), (name, size)
+
+
+@pytest.mark.parametrize("seed", [9111, 19339, 9436])
+def test_files_that_once_broke_a_reader_end_with_a_documented_error(tmp_path, seed):
+    # A range of four numbers, no table of nodes, and a node of the number 2e9.
+    endings, leaks = damage.fuzz_files(tmp_path, [seed])
+    assert not leaks
+    assert all(name.endswith("ValueError") for name in endings)
