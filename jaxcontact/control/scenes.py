@@ -23,6 +23,8 @@ from jaxcontact.scene.ready_made import (
     disc_in_bowl,
     half_disc,
     press,
+    spinning_ball,
+    tumbling_block,
     two_discs,
     two_half_discs,
 )
@@ -42,6 +44,8 @@ __all__ = [
     "half_disc",
     "half_disc_control",
     "press",
+    "spinning_ball",
+    "tumbling_block",
     "two_discs",
     "two_half_discs",
 ]

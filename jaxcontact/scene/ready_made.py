@@ -180,6 +180,51 @@ def disc_in_bowl(h: float = 0.2, gap: float = 0.01, angle: float = 0.2) -> Scene
     )
 
 
+def tumbling_block(h: float = 0.125, size: float = 3.0) -> Scene:
+    """Return a block that may turn, 1 m x 0.5 m, in the middle of a square box of four walls.
+
+    E = 1e6 Pa, nu = 0.3, bulk and shear viscosity 100 Pa s, density 1000 kg/m^2, so that waves run
+    at 37 m/s. There is no gravity. Thrown at 5 m/s it turns from wall to wall.
+
+    Args:
+        h: mesh size, [m].
+        size: length of the walls, [m].
+    """
+    block, half = meshes.rectangle((1.0, 0.5), h=h), 0.5 * size
+    walls = tuple(
+        HalfSpace(point=-half * np.array(inward), normal=np.array(inward))
+        for inward in ([1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0])
+    )
+    return Scene(
+        mesh=block.moved(translation=np.array([-0.5, -0.25])),
+        material=KelvinVoigt(
+            young=1e6, poisson=0.3, bulk_viscosity=100.0, shear_viscosity=100.0, density=1000.0
+        ),
+        contact=dict.fromkeys(block.facets, walls),
+        large_rotation=True,
+    )
+
+
+def spinning_ball(h: float = 0.5, gap: float = 0.01, angle: float = 0.2) -> Scene:
+    """Return a free ball that may turn in a round bowl of three times its radius.
+
+    The body of `disc_in_bowl` in space. Without friction the bowl does not slow a spin down.
+
+    Args:
+        h: mesh size, [m].
+        gap: distance of ball and bowl, [m].
+        angle: of the ball from the lowest point, seen from the centre of the bowl, [rad].
+    """
+    place = (2.0 - gap) * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    return Scene(
+        mesh=meshes.ball(1.0, h=h).moved(translation=place),
+        material=KelvinVoigt(young=1.0, poisson=0.3),
+        contact={"boundary": Ball(center=np.zeros(3), radius=3.0, inside=True)},
+        body_force=np.array([0.0, 0.0, -0.01]),
+        large_rotation=True,
+    )
+
+
 def bumper(h: float = 0.25, slope: float = 0.3, gap: float = 0.02) -> Scene:
     """Return a block between vertical rollers above an inclined plane that fits its lower side.
 

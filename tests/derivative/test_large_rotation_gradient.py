@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.turning import SCHEMES, STEPS, cost, hit, parameters, stepper_of
+from support.turning import DT, SCHEMES, STEPS, cost, hit, parameters, stepper_of
 
 import jaxcontact as jc
 
@@ -63,6 +63,33 @@ def test_gradient_is_exact_with_every_scheme(dimension, scheme, kind):
 @pytest.mark.parametrize("scheme", SCHEMES[:2], ids=lambda x: type(x).__name__)
 def test_gradient_is_exact_on_round_obstacles(scheme, floor, kind):
     check_by_differences(2, scheme, kind, floor)
+
+
+def test_pure_force_and_pure_torque_have_a_gradient():
+    """The adjoint of the mass centre has no torque, that of the rotation no force"""
+    values = parameters(2)
+    stepper = stepper_of(2, values, IMPLICIT, is_flight=True)
+    points = values["points"] + values["displacement"]
+    arm = points - jnp.mean(points, axis=0, keepdims=True)
+    fields = {
+        "way": jnp.ones_like(points) * jnp.array([[1.0, 0.0]]),
+        "spin": arm @ jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+    }
+
+    @jax.jit
+    @jax.jacrev
+    def end(velocity):
+        start = jc.State(values["displacement"], velocity)
+        motion = jc.simulate(stepper, steps=STEPS, initial=start)
+        R = motion.rotation[-1, 0]
+        return jnp.array([motion.centre[-1, 0, 0], jnp.arctan2(R[1, 0], R[0, 0])])
+
+    slopes = end(values["velocity"])
+    found = {name: jnp.sum(slopes * x[None], axis=(1, 2)) for name, x in fields.items()}
+    time = STEPS * DT
+    np.testing.assert_allclose(found["way"], [time, 0.0], atol=1e-10)
+    # The arms are about the mean of the nodes, not about the mass centre.
+    np.testing.assert_allclose(found["spin"], [0.0, time], rtol=2e-2, atol=1e-5)
 
 
 def test_checkpoints_give_the_same_gradient():

@@ -21,6 +21,7 @@ RESULTS = {
     "gradient_convergence": ["gradient"],
     "identification": ["median_miss", "median_gradients"],
     "two_bodies": ["stress_error", "pressure_error", "load_over_one_body", "two_over_one"],
+    "large_motion": ["frames_error", "residual", "energy", "frames_over_small"],
     "reduction": [
         *("displacement_A", "gradient_A", "gradient_speedup", "out_of_reach_over_without"),
         *("optimisation_speedup", "gradient_vmap", "gradient_spread"),

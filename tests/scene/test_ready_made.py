@@ -29,6 +29,8 @@ CASES = {
     "two_discs": (jc.scenes.two_discs(h=0.5, gap=0.01), 0.1, 40, None, None),
     "disc_in_bowl": (jc.scenes.disc_in_bowl(h=0.5), 0.2, 40, None, None),
     "bumper": (jc.scenes.bumper(h=0.5), 0.1, 40, None, None),
+    "tumbling_block": (jc.scenes.tumbling_block(h=0.25), 4e-3, 60, [3.0, -8.0], None),
+    "spinning_ball": (jc.scenes.spinning_ball(h=1.0), 0.2, 40, None, None),
     "press": (jc.scenes.press(h=0.5), 0.1, 40, None, pressing(40)),
 }
 MOVING = {"bars": {"bar0": [0.1]}, "two_discs": {"small": [0.0, -0.1]}, "half_disc": None}
