@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import warnings
 
+import jax
 import numpy as np
 from jax import Array
 
 from jaxcontact.system.bodies import body_numbers
+from jaxcontact.system.lift import Lift
 from jaxcontact.system.system import System
 from jaxcontact.transforms.traced import is_traced
 
@@ -32,7 +34,7 @@ def warn_of_rotation(system: System, unknowns: Array, stride: int) -> None:
     if system.dimension == 1 or system.frames is not None or is_traced((system, unknowns)):
         return
     levels = np.unique(np.linspace(0, len(unknowns) - 1, N_LEVELS).astype(int))
-    y, points = np.asarray(system.lift(unknowns[levels])), np.asarray(system.points)
+    y, points = np.asarray(_seen(system.lifting, unknowns, levels)), np.asarray(system.points)
     # Most motions are too small to turn anything, and need no search for bodies.
     if np.max(np.ptp(y, axis=1)) < np.radians(LARGEST_ANGLE) * np.min(np.ptp(points, axis=0)):
         return
@@ -50,6 +52,12 @@ def warn_of_rotation(system: System, unknowns: Array, stride: int) -> None:
                 stacklevel=3,
             )
             return
+
+
+@jax.jit
+def _seen(lift: Lift, unknowns: Array, levels: Array) -> Array:
+    """Return the nodal displacement at some levels; one program, since every motion needs it."""
+    return lift(unknowns[levels])
 
 
 def _angles(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:

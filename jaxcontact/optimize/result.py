@@ -106,14 +106,15 @@ class Result:
         file that was there before is still there.
         """
         data = {f"history_{name}": getattr(self.history, name) for name in COLUMNS}
-        for number, leaf in enumerate(jax.tree.leaves(self.state)):
-            data[_state_name(number)] = np.asarray(leaf)
+        leaves = jax.tree.leaves(self.state)
+        data |= {_state_name(number): np.asarray(leaf) for number, leaf in enumerate(leaves)}
         with atomic_write(path, "wb") as file:
             np.savez_compressed(
                 file,
                 control=np.asarray(self.control),
                 parameters=np.asarray(self.parameters),
                 value=self.value,
+                state_size=len(leaves),
                 status=self.status.name,
                 method=self.method,
                 uncertified=self.uncertified or NOT_KEPT,
@@ -146,21 +147,21 @@ def load_result(path: str | Path) -> Result:
             f"{path} cannot be read as a saved result ({type(error).__name__}: {error}); it is "
             "damaged or another kind of file. Load a copy, or run the optimisation again"
         ) from error
-    needed = {"control", "parameters", "value", "status", "method"}
+    needed = {"control", "parameters", "value", "state_size", "status", "method"}
     missing = (needed | {f"history_{name}" for name in COLUMNS}) - set(data)
     if missing:
         raise ValueError(f"{path} holds no saved result; {sorted(missing)} are missing")
     history = History(**{name: data[f"history_{name}"] for name in COLUMNS})
-    leaves = [_state_name(k) for k in range(sum(name.startswith("state_") for name in data))]
     is_whole = (
-        all(data[name].shape == () for name in ("value", "status", "method"))
+        all(data[name].shape == () for name in ("value", "state_size", "status", "method"))
         and data["value"].dtype.kind == "f"
+        and data["state_size"].dtype.kind == "i"
         and str(data["status"]) in Ending.__members__
         and all(data[name].dtype.kind == "f" for name in ("control", "parameters"))
         and history.value.ndim == 1
         and history.value.size > 0
         and all(getattr(history, name).shape == history.value.shape for name in COLUMNS)
-        and all(name in data for name in leaves)
+        and all(_state_name(k) in data for k in range(data["state_size"]))
     )
     if not is_whole:
         raise ValueError(
@@ -175,7 +176,7 @@ def load_result(path: str | Path) -> Result:
         status=Ending[str(data["status"])],
         method=str(data["method"]),
         uncertified=str(data.get("uncertified", NOT_KEPT)),
-        state=[data[name] for name in leaves],
+        state=[data[_state_name(k)] for k in range(data["state_size"])],
     )
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxcontact.transforms.traced import as_array, is_traced, poison_unless
+from jaxcontact.transforms.traced import Values, as_array, is_traced, poison_unless
 from jaxcontact.transforms.trees import PyTree
 
 #: How far the slope of a signed distance may be from 1: grids and blends need a little.
@@ -147,7 +147,7 @@ def _normals(gradient: Array, radius: Array) -> tuple[Array, Array]:
     return poison_unless(is_distance & (radius > 0.0), values)
 
 
-def position_sizes(obstacle: Obstacle, points: Array) -> Array:
+def position_sizes(obstacle: Obstacle, points: Array) -> Values:
     """Return the size of the positions that a signed distance is made of, (d,) [m].
 
     Its rounding error is relative to them, also at a node whose own position is zero.
@@ -156,10 +156,12 @@ def position_sizes(obstacle: Obstacle, points: Array) -> Array:
         obstacle: the rigid obstacle; of a user's own one, only the points are known.
         points: contact nodes, (C, d) [m].
     """
-    sizes = jnp.max(jnp.abs(points), axis=0)
+    # On the host where nothing is traced: it is a few numbers, and would be six programs.
+    xp = jnp if is_traced((obstacle, points)) else np
+    sizes = xp.max(xp.abs(xp.asarray(points)), axis=0)
     for part in simple_parts(obstacle):
         for name in ("point", "center", "radius"):
-            sizes = jnp.maximum(sizes, jnp.abs(as_array(getattr(part, name, 0.0))))
+            sizes = xp.maximum(sizes, xp.abs(xp.asarray(getattr(part, name, 0.0))))
     return sizes
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -50,7 +51,12 @@ class ContactPairs(NamedTuple):
 
     def row_weights(self) -> Array:
         """Return the entries of the rows of N, nu and -m_k nu, (C, (1+m) d)."""
-        own = jnp.ones((len(self.nodes), 1), self.normals.dtype)
-        factors = jnp.concatenate([own, -jnp.asarray(self.shares, own.dtype)], axis=1)
-        entries = factors[:, :, None] * self.normals[:, None, :]  # (C, node, i)
-        return entries.reshape(len(entries), entries.shape[1] * entries.shape[2])
+        return _row_weights(self.normals, self.shares)
+
+
+@jax.jit
+def _row_weights(normals: Array, shares: Array) -> Array:
+    own = jnp.ones((len(normals), 1), normals.dtype)
+    factors = jnp.concatenate([own, -shares.astype(own.dtype)], axis=1)
+    entries = factors[:, :, None] * normals[:, None, :]  # (C, node, i)
+    return entries.reshape(len(entries), entries.shape[1] * entries.shape[2])
