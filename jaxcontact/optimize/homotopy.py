@@ -6,7 +6,8 @@ by trust-region Newton-CG for a decreasing sequence of kappa, each started at th
 J_kappa is smooth, its Hessian products are exact, and on weak contact its adjoint tends to the one
 with the right share of the multiplier: the path leads to strong stationarity, where methods for
 the exact problem stall at kinks. Its gaps tell which pairs are weak there, and an exact finish does
-the rest (`finish.py`), so the first problems are solved loosely. Source: MATH.md 5.
+the rest (`finish.py`), so the first problems are solved loosely. Bounds have a barrier that
+vanishes with kappa (`interior.py`). Source: MATH.md 5.
 """
 
 from __future__ import annotations

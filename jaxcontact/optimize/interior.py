@@ -159,8 +159,11 @@ class Interior(Problem):
 def well_inside(bounds: tuple[Array, Array], parameters: Array) -> Array:
     """Return the nearest parameters well within the bounds."""
     low, high = bounds
-    room = jnp.where(jnp.isfinite(high - low), INSIDE * (high - low), INSIDE)
-    return jnp.clip(parameters, low + room, high - room)
+    # A side without a bound has no width: the numbers that are there tell the size.
+    sizes = jnp.abs(jnp.stack([parameters, low, high]))
+    largest = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0))
+    width = jnp.where(jnp.isfinite(high - low), high - low, jnp.where(largest > 0.0, largest, 1.0))
+    return jnp.clip(parameters, low + INSIDE * width, high - INSIDE * width)
 
 
 def snapped(bounds: Bounds, last: Array, before: Array, reduction: float) -> Array:

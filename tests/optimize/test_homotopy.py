@@ -9,6 +9,7 @@ from support.kinked import DT, START, WALL, Grazing, grazing, influence, minimiz
 
 import jaxcontact as jc
 from jaxcontact.control import problem as evaluation
+from jaxcontact.optimize.interior import well_inside
 
 #: The last kappa is 1e-17 of the first one; the error of the control is about its root.
 LEVELS = 18
@@ -87,6 +88,13 @@ def test_homotopy_within_bounds_ends_at_the_bounded_minimiser():
     assert result.control[0, 1, 0] == upper[0, 1, 0]
     assert result.status is jc.Ending.CERTIFIED
     assert result.stationarity.residual < 1e-11 * result.history.gradient_norm[0]
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_first_iterate_within_bounds_is_of_the_size_of_the_problem(size):
+    low, high = size * jnp.array([0.0, -jnp.inf, 1.0]), size * jnp.array([jnp.inf, 1.0, 1.0])
+    inside = well_inside((low, high), size * jnp.array([0.0, 2.0, 5.0]))
+    np.testing.assert_allclose(inside, size * jnp.array([0.05, 0.95, 1.0]), rtol=1e-12)
 
 
 def test_homotopy_within_bounds_continues_from_a_file(tmp_path):
